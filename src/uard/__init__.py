@@ -1,0 +1,63 @@
+"""uard: reinforcement learning that survives rewards that cannot be fully trusted.
+
+The names below are the method. They load on first use, and none of them needs JAX or torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from uard._version import __version__
+
+if TYPE_CHECKING:
+    from uard._checks import InvalidValueError, UnknownNameError
+    from uard.abstention import Abstention
+    from uard.mitigation import Evidence, Feedback, LearningSignal, Mitigation, RewardDiscounting
+    from uard.reliability import ReliabilityFilter, discount, total_uncertainty
+    from uard.uncertainty import sigma_human, sigma_model
+
+_HOME = {
+    "InvalidValueError": "_checks",
+    "UnknownNameError": "_checks",
+    "Abstention": "abstention",
+    "Evidence": "mitigation",
+    "Feedback": "mitigation",
+    "LearningSignal": "mitigation",
+    "Mitigation": "mitigation",
+    "RewardDiscounting": "mitigation",
+    "ReliabilityFilter": "reliability",
+    "discount": "reliability",
+    "total_uncertainty": "reliability",
+    "sigma_human": "uncertainty",
+    "sigma_model": "uncertainty",
+}
+
+__all__ = [
+    "Abstention",
+    "Evidence",
+    "Feedback",
+    "InvalidValueError",
+    "LearningSignal",
+    "Mitigation",
+    "ReliabilityFilter",
+    "RewardDiscounting",
+    "UnknownNameError",
+    "__version__",
+    "discount",
+    "sigma_human",
+    "sigma_model",
+    "total_uncertainty",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'uard' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"uard.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])

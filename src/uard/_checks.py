@@ -1,0 +1,150 @@
+"""Checks of what users hand in: every error names the field, the value and what is allowed."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import sys
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+
+class InvalidValueError(ValueError):
+    """A value that the library cannot work with; the message names field, value and what is allowed."""
+
+    def __init__(self, field: str, value: object, allowed: str):
+        """Say that ``field`` has ``value`` but must be ``allowed``."""
+        super().__init__(f"{field} = {_short(value)}: must be {allowed}")
+        self.field = field
+
+
+class UnknownNameError(InvalidValueError):
+    """A name that is not in the list; the message suggests the nearest one."""
+
+    def __init__(self, field: str, value: str, known: Iterable[str]):
+        """Say that ``value`` is no ``field`` and which of the ``known`` names comes nearest."""
+        names = sorted(known)
+        near = difflib.get_close_matches(value, names, n=1, cutoff=0.5)
+        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        super().__init__(field, value, f"one of {', '.join(names)}{hint}")
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def choose(field: str, value: str, known: Iterable[str]) -> str:
+    """Return ``value`` if it is among the ``known`` names.
+
+    Raises:
+        UnknownNameError: with the nearest known name.
+    """
+    names = list(known)
+    if value not in names:
+        raise UnknownNameError(field, value, names)
+    return value
+
+
+def number(
+    field: str,
+    value: Any,
+    *,
+    low: float = -math.inf,
+    high: float = math.inf,
+    open_low: bool = False,
+) -> None:
+    """Check that ``value`` is a finite real number in ``[low, high]`` (``(low, high]`` if ``open_low``).
+
+    Values that are being traced by JAX pass unchecked: they were checked before tracing.
+    """
+    if is_traced(value):
+        return
+    good = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    good = good and math.isfinite(value) and low <= value <= high and not (open_low and value == low)
+    if not good:
+        raise InvalidValueError(field, value, _interval("a finite number", low, high, open_low))
+
+
+def whole(field: str, value: Any, *, low: int = 0, high: float = math.inf) -> None:
+    """Check that ``value`` is an integer in ``[low, high]``."""
+    good = isinstance(value, int | np.integer) and not isinstance(value, bool) and low <= value <= high
+    if not good:
+        raise InvalidValueError(field, value, _interval("a whole number", low, high, False))
+
+
+def _interval(kind: str, low: float, high: float, open_low: bool) -> str:
+    if low == -math.inf and high == math.inf:
+        return kind
+    if high == math.inf:
+        return f"{kind} {'>' if open_low else '>='} {low:g}"
+    if low == -math.inf:
+        return f"{kind} <= {high:g}"
+    return f"{kind} in {'(' if open_low else '['}{low:g}, {high:g}]"
+
+
+def is_traced(value: Any) -> bool:
+    """Whether ``value`` is an abstract value inside a JAX transformation (never imports JAX)."""
+    jax = sys.modules.get("jax")
+    return jax is not None and isinstance(value, jax.core.Tracer)
+
+
+def finite(field: str, values: Any) -> None:
+    """Check that an array (NumPy, JAX or torch) holds no NaN and no infinity; traced arrays pass."""
+    _check_all(field, values, lambda x: np.isfinite(x), "finite (no NaN, no infinity)")
+
+
+def nonnegative(field: str, values: Any) -> None:
+    """Check that an array is finite and nowhere negative; traced arrays pass."""
+    _check_all(field, values, lambda x: np.isfinite(x) & (x >= 0), "finite and >= 0")
+
+
+def _check_all(field: str, values: Any, good: Any, allowed: str) -> None:
+    if is_traced(values):
+        return
+    array = as_numpy(field, values)
+    bad = ~good(array)
+    if bad.any():
+        index = tuple(int(i) for i in np.argwhere(bad)[0])
+        where = "" if not index else f"[{', '.join(map(str, index))}]"
+        raise InvalidValueError(f"{field}{where}", array[index].item(), allowed)
+
+
+def as_numpy(field: str, values: Any) -> np.ndarray:
+    """Return ``values`` as a NumPy array of floats.
+
+    Raises:
+        InvalidValueError: if something in it (``None``, text) is not a number.
+    """
+    if hasattr(values, "detach"):
+        values = values.detach().cpu()
+    try:
+        array = np.asarray(values)
+        if array.dtype == object:
+            raise TypeError
+        return array.astype(np.float64, copy=False)
+    except (TypeError, ValueError):
+        raise InvalidValueError(field, values, "numbers only; mark a missing one with mask=") from None
+
+
+def same_shape(field: str, value: Any, other_field: str, other: Any) -> None:
+    """Check that two arrays have the same shape."""
+    if tuple(value.shape) != tuple(other.shape):
+        raise InvalidValueError(
+            f"{field}.shape", tuple(value.shape), f"{tuple(other.shape)}, the shape of {other_field}"
+        )
+
+
+def pair(field: str, value: Sequence[int], size: int) -> tuple[int, int]:
+    """Return ``value`` as a (row, column) cell of a ``size`` x ``size`` grid."""
+    allowed = f"a (row, column) pair with both in 0..{size - 1}"
+    try:
+        row, column = value
+    except (TypeError, ValueError):
+        raise InvalidValueError(field, value, allowed) from None
+    for part in (row, column):
+        if isinstance(part, bool) or not isinstance(part, int | np.integer) or not 0 <= part < size:
+            raise InvalidValueError(field, value, allowed)
+    return int(row), int(column)

@@ -1,0 +1,74 @@
+"""A small decision problem as tables, and its one-step dynamics.
+
+``Task`` is what an agent meets. ``HiddenTruth`` is for evaluation only and travels apart from it: no agent,
+feedback model or mitigation takes it as an argument.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Array = Any
+
+
+class Task(NamedTuple):
+    """A deterministic episodic task with S states and A actions.
+
+    Attributes:
+        next_state: (S, A) integers.
+        reward: (S, A) observed (proxy) reward.
+        terminal: (S, A), whether the step ends the episode.
+        start: Starting state.
+        horizon: Steps after which an episode is cut off.
+    """
+
+    next_state: Array
+    reward: Array
+    terminal: Array
+    start: Array
+    horizon: Array
+
+
+class HiddenTruth(NamedTuple):
+    """What only the evaluation sees: (S, A) true reward, hack flag and arrival at the goal."""
+
+    reward: Array
+    hack: Array
+    goal: Array
+
+
+class Ratings(NamedTuple):
+    """What annotators say of a step: rating k is normal with (S, A, K) ``centre`` and ``deviation``."""
+
+    centre: Array
+    deviation: Array
+
+
+def at(table: Array, index: Array) -> Array:
+    """Return ``table[index]`` for an index that is known to be in range (in JAX)."""
+    from jax import lax
+
+    return lax.dynamic_index_in_dim(table, index, 0, keepdims=False, allow_negative_indices=False)
+
+
+def step(task: Task, state: Array, time: Array, action: Array) -> tuple[Array, Array, Array, Array]:
+    """Return (next state, observed reward, terminated, truncated) of step number ``time`` (0-based; in JAX)."""
+    place = state * task.reward.shape[1] + action
+    terminated = at(task.terminal.reshape(-1), place)
+    truncated = (time + 1 >= task.horizon) & ~terminated
+    return at(task.next_state.reshape(-1), place), at(task.reward.reshape(-1), place), terminated, truncated
+
+
+def pad(tables: Any, states: int) -> Any:
+    """Append unreachable states so that tables of several sizes fit one compiled program."""
+
+    def grow(table: np.ndarray) -> np.ndarray:
+        table = np.asarray(table)
+        if table.ndim < 2:
+            return table
+        extra = np.zeros((states - table.shape[0], *table.shape[1:]), table.dtype)
+        return np.concatenate([table, extra])
+
+    return type(tables)(*(grow(t) for t in tables))

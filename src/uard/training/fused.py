@@ -1,0 +1,290 @@
+"""Training of tabular agents as one compiled program.
+
+A *lane* is one run: one environment, panel, mitigation, agent and seed, all of them data. ``train`` runs any number of
+lanes one after the other inside one program (``lax.fori_loop``), which on a CPU beats stepping them side by side: each
+lane's tables stay in the first-level cache and no lane waits for another. The program is compiled once per
+combination of array sizes, heads, raters and class of mitigation; numbers are traced.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from uard.agents import tabular
+from uard.agents.tabular import QLearning
+from uard.envs.tabular import HiddenTruth, Ratings, Task, at, pad, step
+from uard.feedback import running
+from uard.mitigation import Evidence, Feedback, Mitigation
+from uard.training.tracing import traceable
+from uard.training.xla import TABULAR_OPTIONS
+
+CHUNK = 256  # steps whose random numbers are drawn together; what is usual is measured once a chunk
+MIN_STATES = 100  # grids up to 10x10 share one program
+LOG = ("trap_visits", "true_return", "observed_return", "goal", "length", "abstained")
+
+
+class Lane(NamedTuple):
+    """One run, as data. ``truth`` reaches the log only."""
+
+    task: Task
+    ratings: Ratings
+    truth: HiddenTruth
+    agent: QLearning
+    mitigation: Mitigation
+    rated: Any
+    seed: Any
+
+
+@dataclass(frozen=True)
+class Program:
+    """What is fixed when the program is compiled.
+
+    Attributes:
+        episodes: Number of training episodes.
+        ddof: Of the annotators' deviation.
+        snapshots: How many tables to keep along the way, evenly spaced in episodes.
+    """
+
+    episodes: int = 500
+    ddof: int = 0
+    snapshots: int = 0
+
+
+class Outcome(NamedTuple):
+    """What a run leaves behind.
+
+    Attributes:
+        log: (episodes, len(LOG)) per-episode sums.
+        steps: Environment steps taken.
+        q: Final table (S, A, N).
+        feedback: Final rating table (S, A, running.FIELDS).
+        q_snapshots: (snapshots, S, A, N).
+        feedback_snapshots: (snapshots, S, A, running.FIELDS).
+    """
+
+    log: Array
+    steps: Array
+    q: Array
+    feedback: Array
+    q_snapshots: Array
+    feedback_snapshots: Array
+
+
+def lane(
+    task: Task,
+    ratings: Ratings,
+    truth: HiddenTruth,
+    agent: QLearning,
+    mitigation: Mitigation,
+    seed: int,
+    rated: float = 1.0,
+) -> Lane:
+    """Build a lane; tables are padded so that sizes up to 10x10 share a program."""
+    states = max(MIN_STATES, task.next_state.shape[0])
+    return Lane(
+        pad(task, states),
+        pad(ratings, states),
+        pad(truth, states),
+        traceable(agent),
+        traceable(mitigation),
+        np.float32(rated),
+        np.uint32(seed),
+    )
+
+
+def train(lanes: list[Lane], program: Program, fields: tuple[str, ...] = ("log", "steps")) -> list[dict[str, np.ndarray]]:
+    """Train all lanes, which must agree in everything that is not a number, and return the asked-for fields."""
+    room = 1 << (len(lanes) - 1).bit_length()
+    filled = lanes + [lanes[-1]] * (room - len(lanes))
+    stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(x, _narrow(x)) for x in leaves]), *filled)
+    out = _train(stacked, np.int32(len(lanes)), program, fields)
+    host = {name: np.asarray(value) for name, value in out.items()}
+    return [{name: value[i] for name, value in host.items()} for i in range(len(lanes))]
+
+
+def _narrow(x: Any) -> Any:
+    dtype = np.asarray(x).dtype
+    return np.float32 if dtype == np.float64 else np.int32 if dtype == np.int64 else dtype
+
+
+def signature(one: Lane) -> str:
+    """Lanes with equal signatures can be trained by one program."""
+    leaves, tree = jax.tree.flatten(one)
+    return f"{tree} {[np.shape(x) for x in leaves]}"
+
+
+@partial(jax.jit, static_argnames=("program", "fields"), compiler_options=TABULAR_OPTIONS)
+def _train(lanes: Lane, count: Array, program: Program, fields: tuple[str, ...]) -> dict[str, Array]:
+    def pick(i: Array) -> dict[str, Array]:
+        one = jax.tree.map(lambda x: x[i], lanes)
+        outcome = run(one, program)._asdict()
+        return {name: outcome[name] for name in fields}
+
+    room = jax.tree.leaves(lanes)[0].shape[0]
+    shapes = jax.eval_shape(pick, jnp.int32(0))
+    out = jax.tree.map(lambda s: jnp.zeros((room, *s.shape), s.dtype), shapes)
+
+    def body(i: Array, acc: dict[str, Array]) -> dict[str, Array]:
+        return jax.tree.map(lambda a, x: lax.dynamic_update_index_in_dim(a, x, i, 0), acc, pick(i))
+
+    return lax.fori_loop(0, count, body, out)
+
+
+class _Carry(NamedTuple):
+    q: Array
+    row: Array  # q[state], carried so that it is read once
+    feedback: Array
+    usual: Any
+    state: Array
+    time: Array
+    episode: Array
+    epsilon: Array
+    sums: Array
+    log: Array
+    steps: Array
+
+
+def run(one: Lane, program: Program) -> Outcome:
+    """Train one lane (pure; jit and vmap it at will)."""
+    task, agent, mitigation = one.task, one.agent, one.mitigation
+    states, actions = task.next_state.shape
+    raters = one.ratings.centre.shape[-1]
+    listens = mitigation.reads_feedback
+    # One row per state-action, so that a step reads each table once.
+    scored = jnp.stack(
+        [one.truth.hack, one.truth.reward, task.reward, one.truth.goal, jnp.ones_like(task.reward)], axis=-1
+    ).astype(jnp.float32).reshape(states * actions, len(LOG) - 1)
+    centre = one.ratings.centre.reshape(states * actions, raters)
+    deviation = one.ratings.deviation.reshape(states * actions, raters)
+    agent_words = tabular.words(agent)
+    rater_words = raters + 1 if listens else 0
+    asks = agent.abstention is not None and agent.abstention.response == "ask"
+    skips = agent.abstention is not None and agent.abstention.response == "skip"
+
+    def heard(rows: Array) -> Feedback:
+        return running.read(rows, raters)
+
+    def usual(feedback: Array) -> Any:
+        return mitigation.usual(heard(feedback), feedback[..., 0] > 0)
+
+    def choose(c: _Carry, explore: Array, random_action: Array) -> tuple[Array, Array, Array]:
+        mu, sigma_m = tabular.mean_and_deviation(c.row)
+        scores = mitigation.score(mu, sigma_m, heard(at(c.feedback, c.state)), c.usual)
+        best = jnp.argmax(scores).astype(jnp.int32)
+        abstained = jnp.float32(0.0)
+        if agent.abstention is not None:
+            feedback = heard(at(c.feedback, c.state))
+            u = 0.5 * sigma_m + 0.5 * jnp.where(feedback.count > 0, feedback.spread, 0.0)
+            defers = agent.abstention.abstains(u[best], mu[best])
+            abstained = defers.astype(jnp.float32)
+            if agent.abstention.response == "safe":
+                best = jnp.where(defers, jnp.argmin(u).astype(jnp.int32), best)
+        return jnp.where(explore < c.epsilon, random_action, best), sigma_m, abstained
+
+    def one_step(c: _Carry, draws: Any) -> tuple[_Carry, None]:
+        own, noise, rated = draws
+        action, sigma_m, abstained = choose(c, own.explore, own.action)
+        state2, reward, terminated, truncated = step(task, c.state, c.time, action)
+        place = c.state * actions + action
+        active = (c.episode < program.episodes).astype(jnp.float32)
+
+        feedback = c.feedback
+        if listens:
+            spoken = at(centre, place) + at(deviation, place) * noise
+            rated = jnp.maximum(rated, abstained) if asks else rated
+            entry = running.updated(
+                at(at(feedback, c.state), action), running.summarise(spoken, program.ddof), reward, rated * active
+            )
+            entry = lax.optimization_barrier(entry)
+            feedback = lax.dynamic_update_slice(feedback, entry[None, None], (c.state, action, 0))
+            known = heard(entry)
+        else:
+            known = heard(at(at(feedback, c.state), action))
+        signal = mitigation.signal(Evidence(reward, at(sigma_m, action), known), c.usual)
+
+        following = at(c.q, state2)
+        if mitigation.backup == "greedy":
+            value = following.max(0)
+        else:
+            mu2, sigma2 = tabular.mean_and_deviation(following)
+            best2 = jnp.argmax(mitigation.score(mu2, sigma2, heard(at(feedback, state2)), c.usual))
+            value = at(following, best2)
+        target = signal.reward + jnp.where(terminated, 0.0, agent.gamma * value)
+        rate = agent.learning_rate * active * signal.sample_weight * own.mask
+        if skips:
+            rate = rate * (1.0 - abstained)
+        old = at(c.row, action)
+        # The two barriers keep XLA from computing these again inside the writes below, which would then need a copy
+        # of the whole table at every step.
+        target = lax.optimization_barrier(target)
+        q = lax.dynamic_update_slice(c.q, (old + rate * (target - old))[None, None], (c.state, action, 0))
+
+        done = terminated | truncated
+        sums = c.sums + at(scored, place)
+        log = lax.dynamic_update_slice(c.log, sums[None], (jnp.minimum(c.episode, program.episodes), 0))
+        state = jnp.where(done, task.start, state2)
+        return _Carry(
+            q=q,
+            row=at(q, state),
+            feedback=feedback,
+            usual=c.usual,
+            state=state,
+            time=jnp.where(done, 0, c.time + 1),
+            episode=c.episode + done,
+            epsilon=jnp.where(done, tabular.next_epsilon(agent, c.epsilon), c.epsilon),
+            sums=jnp.where(done, 0.0, sums),
+            log=log,
+            steps=c.steps + active.astype(jnp.int32),
+        ), None
+
+    def chunk(loop: tuple[_Carry, Array, Array, Array]) -> tuple[_Carry, Array, Array, Array]:
+        c, number, q_kept, f_kept = loop
+        key = jax.random.wrap_key_data(jnp.stack([one.seed, number]), impl="threefry2x32")
+        bits = jax.random.bits(key, (CHUNK, agent_words + rater_words), jnp.uint32)
+        own = tabular.draw(agent, bits[:, :agent_words], actions)
+        noise, rated = jnp.zeros((CHUNK, 0)), jnp.zeros((CHUNK, 0))
+        if listens:
+            noise = _normal(bits[:, agent_words:-1])
+            rated = (tabular.uniform(bits[:, -1]) < one.rated).astype(jnp.float32)
+            c = c._replace(usual=usual(c.feedback))
+        c, _ = lax.scan(one_step, c, (own, noise, rated))
+        if program.snapshots:
+            slot = jnp.minimum(c.episode * program.snapshots // program.episodes, program.snapshots - 1)
+            q_kept = lax.dynamic_update_index_in_dim(q_kept, c.q, slot, 0)
+            f_kept = lax.dynamic_update_index_in_dim(f_kept, c.feedback, slot, 0)
+        return c, number + 1, q_kept, f_kept
+
+    key = jax.random.wrap_key_data(jnp.stack([one.seed, jnp.uint32(0)]), impl="threefry2x32")
+    q = tabular.init(agent, key, states, actions)
+    feedback = running.empty(states, actions)
+    start = _Carry(
+        q=q,
+        row=q[task.start],
+        feedback=feedback,
+        usual=usual(feedback),
+        state=jnp.asarray(task.start, jnp.int32),
+        time=jnp.int32(0),
+        episode=jnp.int32(0),
+        epsilon=jnp.float32(agent.epsilon),
+        sums=jnp.zeros(len(LOG) - 1, jnp.float32),
+        log=jnp.zeros((program.episodes + 1, len(LOG) - 1), jnp.float32),
+        steps=jnp.int32(0),
+    )
+    kept = jnp.zeros((program.snapshots, *q.shape)), jnp.zeros((program.snapshots, *feedback.shape))
+    c, _, q_kept, f_kept = lax.while_loop(
+        lambda loop: loop[0].episode < program.episodes, chunk, (start, jnp.uint32(1), *kept)
+    )
+    return Outcome(c.log[:-1], c.steps, c.q, c.feedback, q_kept, f_kept)
+
+
+def _normal(bits: Array) -> Array:
+    """Turn 32 random bits into a standard normal by the inverse of its distribution function."""
+    u = tabular.uniform(bits) + jnp.float32(2.0**-25)
+    return jnp.float32(np.sqrt(2.0)) * lax.erf_inv(2.0 * u - 1.0)
