@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 from uard import _checks, adaptation, uncertainty
@@ -312,20 +313,20 @@ def uard_paper(
 NAMED: dict[str, Callable[..., Mitigation]] = {
     "raw": Raw,
     "mean-of-annotations": RatedReward,
-    "worst-of-annotations": lambda **kw: RatedReward(**({"statistic": "lowest"} | kw)),
-    "lcb": lambda **kw: RatedReward(**({"statistic": "bound"} | kw)),
+    "worst-of-annotations": partial(RatedReward, statistic="lowest"),
+    "lcb": partial(RatedReward, statistic="bound"),
     "screening": Screening,
     "uard": uard,
     "uard-paper": uard_paper,
-    "uard-consistent": lambda **kw: uard_paper(**({"backup": "consistent"} | kw)),
-    "uard-operator": lambda **kw: uard_paper(**({"acts_on": "reward"} | kw)),
-    "uard-lite": lambda **kw: uard_paper(**({"beta": 0.0} | kw)),
-    "human-only": lambda **kw: uard_paper(**({"alpha": 0.0} | kw)),
-    "no-discount": lambda **kw: uard_paper(**({"lam": 0.0} | kw)),
-    "uard-exponential": lambda **kw: uard_paper(**({"form": "exponential"} | kw)),
-    "uard-linear": lambda **kw: uard_paper(**({"form": "linear"} | kw)),
-    "uard-certainty-equivalent": lambda **kw: uard_paper(**({"form": "certainty-equivalent"} | kw)),
-    "uard-wiener": lambda **kw: uard_paper(**({"form": "wiener"} | kw)),
+    "uard-consistent": partial(uard_paper, backup="consistent"),
+    "uard-operator": partial(uard_paper, acts_on="reward"),
+    "uard-lite": partial(uard_paper, beta=0.0),
+    "human-only": partial(uard_paper, alpha=0.0),
+    "no-discount": partial(uard_paper, lam=0.0),
+    "uard-exponential": partial(uard_paper, form="exponential"),
+    "uard-linear": partial(uard_paper, form="linear"),
+    "uard-certainty-equivalent": partial(uard_paper, form="certainty-equivalent"),
+    "uard-wiener": partial(uard_paper, form="wiener"),
 }
 
 

@@ -163,9 +163,7 @@ class ReliabilityFilter:
             return certainty_equivalent_weight(u, mu, strength)
         return wiener_weight(mu * mu, (strength * u) * (strength * u))
 
-    def score(
-        self, mu: Array, sigma_m: Array, sigma_h: Array, anchor: Array = 0.0, lam: Array | None = None
-    ) -> Array:
+    def score(self, mu: Array, sigma_m: Array, sigma_h: Array, anchor: Array = 0.0, lam: Array | None = None) -> Array:
         """J = b + w (mu - b), the confidence-adjusted action score (A19 for b = 0).
 
         The same call discounts a reward: pass the reward as ``mu``.

@@ -43,7 +43,11 @@ def sign_preservation_radius(
 
 
 def perturbed_advantage(
-    advantage: Array, epsilon: Array, weight: Array = 1.0, definition: Definition = "before", other_weight: Array = 1.0
+    advantage: Array,
+    epsilon: Array,
+    weight: Array = 1.0,
+    definition: Definition = "before",
+    other_weight: Array = 1.0,
 ) -> Array:
     """The advantage after a reward perturbation ``epsilon`` >= 0 against it: the y-axis of the paper's figure (G13).
 

@@ -96,7 +96,9 @@ def _masked_std(ratings: Array, mask: Array, axis: int, ddof: int, empty: float 
     count = xp.sum(here, axis=axis, keepdims=True)
     few = count <= ddof
     if empty is None and not _checks.is_traced(few) and bool(xp.any(few)):
-        raise _checks.InvalidValueError("mask", "a place with too few ratings", f"more than {ddof} everywhere, or give empty=")
+        raise _checks.InvalidValueError(
+            "mask", "a place with too few ratings", f"more than {ddof} everywhere, or give empty="
+        )
     one = xp.ones_like(count)
     centre = xp.sum(values, axis=axis, keepdims=True) / xp.where(count > 0, count, one)
     square = xp.where(mask, (values - centre) * (values - centre), xp.zeros_like(values))

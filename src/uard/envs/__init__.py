@@ -1,0 +1,1 @@
+"""Environments and the panels that rate them."""

@@ -68,7 +68,5 @@ def ratings(panel: str, task: Task, truth: HiddenTruth, noise: float = 0.0) -> R
     """
     speak = PANELS[_checks.choose("panel", panel, PANELS)]
     _checks.number("noise", noise, low=0)
-    centre, deviation = speak(
-        np.asarray(task.reward, float), np.asarray(truth.reward, float), np.asarray(truth.hack)
-    )
+    centre, deviation = speak(np.asarray(task.reward, float), np.asarray(truth.reward, float), np.asarray(truth.hack))
     return Ratings(centre.astype(np.float32), np.sqrt(deviation**2 + noise**2).astype(np.float32))

@@ -1,0 +1,1 @@
+"""The laboratory: studies as data, their store, statistics, ledger and report."""

@@ -99,7 +99,9 @@ def lane(
     )
 
 
-def train(lanes: list[Lane], program: Program, fields: tuple[str, ...] = ("log", "steps")) -> list[dict[str, np.ndarray]]:
+def train(
+    lanes: list[Lane], program: Program, fields: tuple[str, ...] = ("log", "steps")
+) -> list[dict[str, np.ndarray]]:
     """Train all lanes, which must agree in everything that is not a number, and return the asked-for fields."""
     room = 1 << (len(lanes) - 1).bit_length()
     filled = lanes + [lanes[-1]] * (room - len(lanes))
@@ -158,9 +160,14 @@ def run(one: Lane, program: Program) -> Outcome:
     raters = one.ratings.centre.shape[-1]
     listens = mitigation.reads_feedback
     # One row per state-action, so that a step reads each table once.
-    scored = jnp.stack(
-        [one.truth.hack, one.truth.reward, task.reward, one.truth.goal, jnp.ones_like(task.reward)], axis=-1
-    ).astype(jnp.float32).reshape(states * actions, len(LOG) - 1)
+    scored = (
+        jnp.stack(
+            [one.truth.hack, one.truth.reward, task.reward, one.truth.goal, jnp.ones_like(task.reward)],
+            axis=-1,
+        )
+        .astype(jnp.float32)
+        .reshape(states * actions, len(LOG) - 1)
+    )
     centre = one.ratings.centre.reshape(states * actions, raters)
     deviation = one.ratings.deviation.reshape(states * actions, raters)
     agent_words = tabular.words(agent)
@@ -200,7 +207,10 @@ def run(one: Lane, program: Program) -> Outcome:
             spoken = at(centre, place) + at(deviation, place) * noise
             rated = jnp.maximum(rated, abstained) if asks else rated
             entry = running.updated(
-                at(at(feedback, c.state), action), running.summarise(spoken, program.ddof), reward, rated * active
+                at(at(feedback, c.state), action),
+                running.summarise(spoken, program.ddof),
+                reward,
+                rated * active,
             )
             entry = lax.optimization_barrier(entry)
             feedback = lax.dynamic_update_slice(feedback, entry[None, None], (c.state, action, 0))
@@ -226,7 +236,7 @@ def run(one: Lane, program: Program) -> Outcome:
         target = lax.optimization_barrier(target)
         q = lax.dynamic_update_slice(c.q, (old + rate * (target - old))[None, None], (c.state, action, 0))
 
-        done = terminated | truncated
+        done = jnp.logical_or(terminated, truncated)
         sums = c.sums + at(scored, place)
         log = lax.dynamic_update_slice(c.log, sums[None], (jnp.minimum(c.episode, program.episodes), 0))
         state = jnp.where(done, task.start, state2)

@@ -1,8 +1,8 @@
 """How XLA should compile our loops on a CPU.
 
-A training loop over small tables spends its time in starting kernels: about 20 a step, 0.1 us each. XLA can compile a
-small loop whole, as one native function, but by default only if it touches less than 1 KB. Raising that bound
-makes the tabular program 20 times faster (0.4 to 8 million steps a second). The bound is read when JAX starts its backend,
+A training loop over small tables spends its time in starting kernels: about 20 a step, 0.1 us each. XLA can compile
+a small loop whole, as one native function, but by default only if it touches less than 1 KB. Raising that bound makes
+the tabular program 20 times faster (0.4 to 8 million steps a second). The bound is read when JAX starts its backend,
 so it has to be in the environment before that; loops with matrix products are never compiled that way.
 """
 
