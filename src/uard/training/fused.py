@@ -160,14 +160,9 @@ def run(one: Lane, program: Program) -> Outcome:
     raters = one.ratings.centre.shape[-1]
     listens = mitigation.reads_feedback
     # One row per state-action, so that a step reads each table once.
-    scored = (
-        jnp.stack(
-            [one.truth.hack, one.truth.reward, task.reward, one.truth.goal, jnp.ones_like(task.reward)],
-            axis=-1,
-        )
-        .astype(jnp.float32)
-        .reshape(states * actions, len(LOG) - 1)
-    )
+    one_each = jnp.ones_like(task.reward)
+    columns = [one.truth.hack, one.truth.reward, task.reward, one.truth.goal, one_each, 0.0 * one_each]
+    scored = jnp.stack(columns, axis=-1).astype(jnp.float32).reshape(states * actions, len(LOG))
     centre = one.ratings.centre.reshape(states * actions, raters)
     deviation = one.ratings.deviation.reshape(states * actions, raters)
     agent_words = tabular.words(agent)
@@ -237,7 +232,10 @@ def run(one: Lane, program: Program) -> Outcome:
         q = lax.dynamic_update_slice(c.q, (old + rate * (target - old))[None, None], (c.state, action, 0))
 
         done = jnp.logical_or(terminated, truncated)
-        sums = c.sums + at(scored, place)
+        counted = at(scored, place)
+        if agent.abstention is not None:
+            counted = jnp.where(jnp.arange(len(LOG)) == LOG.index("abstained"), abstained, counted)
+        sums = c.sums + counted
         log = lax.dynamic_update_slice(c.log, sums[None], (jnp.minimum(c.episode, program.episodes), 0))
         state = jnp.where(done, task.start, state2)
         return _Carry(
@@ -283,8 +281,8 @@ def run(one: Lane, program: Program) -> Outcome:
         time=jnp.int32(0),
         episode=jnp.int32(0),
         epsilon=jnp.float32(agent.epsilon),
-        sums=jnp.zeros(len(LOG) - 1, jnp.float32),
-        log=jnp.zeros((program.episodes + 1, len(LOG) - 1), jnp.float32),
+        sums=jnp.zeros(len(LOG), jnp.float32),
+        log=jnp.zeros((program.episodes + 1, len(LOG)), jnp.float32),
         steps=jnp.int32(0),
     )
     kept = jnp.zeros((program.snapshots, *q.shape)), jnp.zeros((program.snapshots, *feedback.shape))

@@ -1,0 +1,88 @@
+"""A cell: everything that defines a result but the seed, as one frozen object with a key."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from uard import _checks
+from uard.agents.tabular import QLearning
+from uard.envs.panels import PANELS
+from uard.envs.trapgrid import TrapGrid
+from uard.mitigation import Mitigation, Raw
+
+# Raise this when training code changes what a cell means: old results are then not found, never mixed in.
+RESULTS = 1
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One environment, panel, agent and mitigation, trained for some episodes.
+
+    Attributes:
+        environment: The grid.
+        mitigation: What the agent does about a reward that may lie.
+        agent: The learner.
+        panel: Who rates. Irrelevant, and therefore ignored, for a mitigation that reads no ratings.
+        noise: Standard deviation of extra noise on every rater, in reward units.
+        rated: Fraction of steps that are rated, in [0, 1].
+        episodes: Training episodes, >= 1.
+        ddof: Of the annotators' deviation.
+        snapshots: Tables kept along the way, for the uncertainty curves.
+    """
+
+    environment: TrapGrid = field(default_factory=TrapGrid)
+    mitigation: Mitigation = field(default_factory=Raw)
+    agent: QLearning = field(default_factory=QLearning)
+    panel: str = "main"
+    noise: float = 0.0
+    rated: float = 1.0
+    episodes: int = 500
+    ddof: int = 0
+    snapshots: int = 0
+
+    def __post_init__(self) -> None:
+        """Check everything; forget what cannot matter."""
+        _checks.choose("panel", self.panel, PANELS)
+        _checks.number("noise", self.noise, low=0)
+        _checks.number("rated", self.rated, low=0, high=1)
+        _checks.whole("episodes", self.episodes, low=1, high=1_000_000)
+        _checks.whole("ddof", self.ddof, low=0, high=1)
+        _checks.whole("snapshots", self.snapshots, low=0, high=1000)
+        if not isinstance(self.mitigation, Mitigation):
+            raise _checks.InvalidValueError("mitigation", self.mitigation, "a Mitigation (see uard.Mitigation)")
+        if not self.mitigation.reads_feedback:
+            for name, value in (("panel", "main"), ("noise", 0.0), ("rated", 1.0)):
+                object.__setattr__(self, name, value)
+        object.__setattr__(self, "noise", float(self.noise))
+        object.__setattr__(self, "rated", float(self.rated))
+
+    def config(self) -> dict[str, Any]:
+        """Return the whole configuration as plain data."""
+        return plain(self)
+
+    @property
+    def key(self) -> str:
+        """A name made of the whole configuration: equal cells have equal keys, and only they."""
+        text = json.dumps({"results": RESULTS, "cell": self.config()}, sort_keys=True, allow_nan=False)
+        return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+    def with_(self, **changes: Any) -> Cell:
+        """Return a copy with some fields changed."""
+        return replace(self, **changes)
+
+
+def plain(value: Any) -> Any:
+    """Turn (nested) dataclasses into dictionaries that name their class."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        cls = type(value)
+        fields = {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {"class": f"{cls.__module__}.{cls.__qualname__}", **fields}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    return value

@@ -1,0 +1,128 @@
+"""Where finished seeds live: one SQLite file, written in transactions, so nothing half-written is ever read."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from uard import __version__
+from uard.lab.cell import Cell
+from uard.lab.result import CorruptResultError, Result
+
+_SCHEMA = """
+create table if not exists cells (key text primary key, config text not null);
+create table if not exists results (
+    key text not null references cells (key), seed integer not null, data blob not null, checksum text not null,
+    version text not null, created real not null, primary key (key, seed)
+);
+create table if not exists quarantine (key text, seed integer, data blob, reason text, created real);
+"""
+
+
+class StoreError(RuntimeError):
+    """The result store cannot be used; the message names the file and says what to do."""
+
+
+class Store:
+    """Finished results by (cell, seed). Several processes may use one file.
+
+    Attributes:
+        path: The file; ``:memory:`` keeps nothing.
+    """
+
+    def __init__(self, path: str | Path):
+        """Open the file, or make it.
+
+        Raises:
+            StoreError: the folder cannot be written, or the file is no sound result store.
+        """
+        self.path = str(path)
+        try:
+            if self.path != ":memory:":
+                Path(self.path).parent.mkdir(parents=True, exist_ok=True)
+            self._db = sqlite3.connect(self.path, timeout=60)
+            if self._db.execute("pragma quick_check(1)").fetchone()[0] != "ok":
+                raise sqlite3.DatabaseError("its pages are damaged")
+            self._db.execute("pragma journal_mode=wal")
+            self._db.execute("pragma synchronous=normal")
+            with self._db:
+                self._db.executescript(_SCHEMA)
+        except OSError as error:
+            raise StoreError(f"store = {self.path!r}: must be in a folder that can be written ({error})") from None
+        except sqlite3.OperationalError as error:
+            raise StoreError(f"store = {self.path!r}: must be a file that can be written ({error})") from None
+        except sqlite3.DatabaseError as error:
+            raise StoreError(
+                f"store = {self.path!r}: must be a result store, but {error}. Nothing was changed. Move the file aside "
+                "and start again, or name another with --store"
+            ) from None
+
+    def close(self) -> None:
+        """Close the file."""
+        self._db.close()
+
+    def have(self, cell: Cell) -> set[int]:
+        """Return the seeds that are finished."""
+        return {row[0] for row in self._db.execute("select seed from results where key = ?", (cell.key,))}
+
+    def missing(self, cell: Cell, seeds: Iterable[int]) -> list[int]:
+        """Return those of the seeds that are not finished."""
+        done = self.have(cell)
+        return [s for s in seeds if s not in done]
+
+    def put(self, finished: Sequence[tuple[Cell, int, Result]]) -> None:
+        """Write some results, all or none.
+
+        Raises:
+            StoreError: the file cannot be written (a full disk, say); what was there stays.
+        """
+        now = time.time()
+        try:
+            with self._db:
+                for cell, seed, result in finished:
+                    key = cell.key
+                    self._db.execute(
+                        "insert or ignore into cells values (?, ?)", (key, json.dumps(cell.config(), sort_keys=True))
+                    )
+                    self._db.execute(
+                        "insert or ignore into results values (?, ?, ?, ?, ?, ?)",
+                        (key, seed, *result.pack(), __version__, now),
+                    )
+        except sqlite3.Error as error:
+            raise StoreError(
+                f"store = {self.path!r}: cannot be written ({error}); what was finished before is safe"
+            ) from None
+
+    def get(self, cell: Cell, seeds: Iterable[int]) -> dict[int, Result]:
+        """Return the finished ones of the seeds.
+
+        A corrupt one is moved to the table ``quarantine`` and left out, so that it is trained again.
+        """
+        wanted = set(seeds)
+        found: dict[int, Result] = {}
+        rows = self._db.execute("select seed, data, checksum from results where key = ?", (cell.key,)).fetchall()
+        for seed, data, checksum in rows:
+            if seed not in wanted:
+                continue
+            try:
+                found[seed] = Result.unpack(data, checksum)
+            except (CorruptResultError, ValueError, KeyError, OSError) as error:
+                self._quarantine(cell.key, seed, data, str(error))
+        return found
+
+    def _quarantine(self, key: str, seed: int, data: bytes, reason: str) -> None:
+        with self._db:
+            self._db.execute("insert into quarantine values (?, ?, ?, ?, ?)", (key, seed, data, reason, time.time()))
+            self._db.execute("delete from results where key = ? and seed = ?", (key, seed))
+
+    def quarantined(self) -> list[tuple[str, int, str]]:
+        """Return (key, seed, reason) of every result that was found corrupt."""
+        return [tuple(row) for row in self._db.execute("select key, seed, reason from quarantine")]
+
+    def count(self) -> tuple[int, int]:
+        """Return the numbers of cells and of finished seeds."""
+        row = self._db.execute("select count(distinct key), count(*) from results").fetchone()
+        return int(row[0]), int(row[1])
