@@ -26,7 +26,7 @@ class UnknownNameError(InvalidValueError):
     def __init__(self, field: str, value: str, known: Iterable[str]):
         """Say that ``value`` is no ``field`` and which of the ``known`` names comes nearest."""
         names = sorted(known)
-        near = difflib.get_close_matches(value, names, n=1, cutoff=0.5)
+        near = difflib.get_close_matches(str(value).lower(), names, n=1, cutoff=0.5)
         hint = f" (did you mean {near[0]!r}?)" if near else ""
         super().__init__(field, value, f"one of {', '.join(names)}{hint}")
 
@@ -58,12 +58,15 @@ def number(
 ) -> None:
     """Check that ``value`` is a finite real number in ``[low, high]`` (``(low, high]`` if ``open_low``).
 
+    Arrays without dimensions are numbers too.
+
     Values that are being traced by JAX pass unchecked: they were checked before tracing.
     """
     if is_traced(value):
         return
-    good = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    good = good and math.isfinite(value) and low <= value <= high and not (open_low and value == low)
+    plain = value.item() if getattr(value, "shape", None) == () else value
+    good = isinstance(plain, int | float | np.floating) and not isinstance(plain, bool)
+    good = good and abs(plain) <= sys.float_info.max and low <= plain <= high and not (open_low and plain == low)
     if not good:
         raise InvalidValueError(field, value, _interval("a finite number", low, high, open_low))
 
@@ -119,14 +122,15 @@ def as_numpy(field: str, values: Any) -> np.ndarray:
         InvalidValueError: if something in it (``None``, text) is not a number.
     """
     if hasattr(values, "detach"):
-        values = values.detach().cpu()
+        values = values.detach().cpu().double()  # NumPy has no bfloat16
     try:
         array = np.asarray(values)
-        if array.dtype == object:
+        if array.dtype.kind in "OSUMmc":
             raise TypeError
         return array.astype(np.float64, copy=False)
     except (TypeError, ValueError):
-        raise InvalidValueError(field, values, "numbers only; mark a missing one with mask=") from None
+        allowed = "real numbers in rows of equal length (a missing rating is marked with mask=)"
+        raise InvalidValueError(field, values, allowed) from None
 
 
 def same_shape(field: str, value: Any, other_field: str, other: Any) -> None:

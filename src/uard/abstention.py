@@ -44,5 +44,7 @@ class Abstention:
 
     def abstains(self, u: Array, mu: Array) -> Array:
         """Return True where the agent should not act on ``mu`` with total uncertainty ``u``."""
+        _checks.nonnegative("u", u)
+        _checks.finite("mu", mu)
         level = u if self.rule == "threshold" else uncertainty_ratio(u, mu, self.eps)
         return namespace(level).asarray(level > self.limit) if not hasattr(level, "shape") else level > self.limit

@@ -5,7 +5,7 @@ NumPy functions for evaluation: they read the true reward, so no agent may call 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,17 +17,17 @@ class Reliability(NamedTuple):
 
     sigma: np.ndarray
     error: np.ndarray
-    count: np.ndarray
+    count: Any  # an array; tuple has a method of that name
 
 
 def _pair(name_a: str, a: object, name_b: str, b: object, least: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    x, y = _checks.as_numpy(name_a, a).ravel(), _checks.as_numpy(name_b, b).ravel()
+    x, y = _checks.as_numpy(name_a, a), _checks.as_numpy(name_b, b)
     _checks.finite(name_a, x)
     _checks.finite(name_b, y)
     _checks.same_shape(name_a, x, name_b, y)
     if x.size < least:
         raise _checks.InvalidValueError(f"{name_a}.size", x.size, f">= {least}")
-    return x, y
+    return x.ravel(), y.ravel()
 
 
 def reliability_diagram(sigma: object, error: object, bins: int = 10) -> Reliability:
@@ -39,6 +39,7 @@ def reliability_diagram(sigma: object, error: object, bins: int = 10) -> Reliabi
         bins: Number of bins; fewer where there are fewer points.
     """
     x, y = _pair("sigma", sigma, "error", error)
+    _checks.nonnegative("error", error)
     _checks.whole("bins", bins, low=1)
     parts = [p for p in np.array_split(np.argsort(x, kind="stable"), min(bins, x.size)) if p.size]
     return Reliability(
@@ -85,6 +86,6 @@ def tpr_at_fpr(score: object, hack: object, fpr: float = 0.01) -> float:
     if positive.all() or not positive.any():
         raise _checks.InvalidValueError("hack", f"{int(positive.sum())} of {x.size} true", "of both kinds")
     honest = np.sort(x[~positive])[::-1]
-    allowed = int(np.floor(fpr * honest.size))
+    allowed = int(np.floor(fpr * honest.size + 1e-9))  # 0.29 * 100 is 28.999...
     threshold = honest[allowed] if allowed < honest.size else -np.inf
     return float((x[positive] > threshold).mean())

@@ -1,5 +1,297 @@
-"""The command line."""
+"""The command line: ``uard run``, ``reproduce``, ``ledger``, ``list``. Imports what a command needs, when it needs it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from uard import __version__
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+DEFAULT_STORE = "results/uard.sqlite"
+_NEEDS_LAB = "the laboratory is not installed: pip install 'uard[lab]'"
+
+try:
+    import tyro
+    from tyro.conf import Positional, UseAppendAction, arg
+except ModuleNotFoundError:  # the core is installed without its laboratory
+    sys.exit(_NEEDS_LAB)
+
+_Pairs = UseAppendAction[tuple[str, ...]]
 
 
-def main() -> None:
-    """Run it."""
+@dataclass(frozen=True)
+class Run:
+    """Train one agent on one environment with one mitigation, and print its metrics.
+
+    Metrics are per episode over the last 100 episodes; every interval is over seeds.
+    """
+
+    environment: Positional[str] = "TrapGrid"
+    """Which environment (see `uard list`)."""
+    set: Annotated[_Pairs, arg(metavar="NAME=VALUE")] = ()
+    """Change a field of the environment, e.g. size=12 or 'traps=[[2,5],[7,3]]'. Repeatable."""
+    agent: str = "q-learning"
+    """Which agent."""
+    set_agent: Annotated[_Pairs, arg(metavar="NAME=VALUE")] = ()
+    """Change a field of the agent, e.g. heads=1. Repeatable."""
+    mitigation: str = "uard"
+    """What the agent does about a reward that may lie."""
+    set_mitigation: Annotated[_Pairs, arg(metavar="NAME=VALUE")] = ()
+    """Change a field of the mitigation, e.g. lam=5 or kappa=0. Repeatable."""
+    panel: str = "main"
+    """Who rates."""
+    noise: float = 0.0
+    """Standard deviation of extra noise on every rater, in reward units."""
+    noise_fraction: float | None = None
+    """The same as a fraction of the trap's reward (instead of --noise)."""
+    rated: float = 1.0
+    """Fraction of steps that are rated."""
+    episodes: int = 500
+    """Training episodes."""
+    seeds: int = 10
+    """Number of seeds (0, 1, ...)."""
+    json: str | None = None
+    """Write one JSON object to this file; - for standard output."""
+    store: str | None = None
+    """Keep finished seeds in this file and do not train them again."""
+
+
+@dataclass(frozen=True)
+class Reproduce:
+    """Run the paper's grid studies and ours, and write the report. Finished cells are never run again."""
+
+    studies: Positional[tuple[str, ...]] = ()
+    """Which studies (see `uard list`); all of the grid if left out."""
+    seeds: int = 10
+    """Number of seeds (0, 1, ...)."""
+    report: str | None = None
+    """Write the report into this folder; only possible for the whole grid."""
+    store: str = DEFAULT_STORE
+    """Where finished seeds are kept."""
+    workers: int | None = None
+    """Processes; one per core if left out."""
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """Say of every claim of the paper that a grid can answer whether it holds."""
+
+    claims: Positional[tuple[str, ...]] = ()
+    """Only these, e.g. J5 F3; all if left out."""
+    json: str | None = None
+    """Write the ledger as JSON to this file; - for standard output."""
+    seeds: int = 10
+    """Number of seeds (0, 1, ...)."""
+    store: str = DEFAULT_STORE
+    """Where finished seeds are kept; what is missing is trained first."""
+    workers: int | None = None
+    """Processes; one per core if left out."""
+
+
+@dataclass(frozen=True)
+class List:
+    """List environments, agents, mitigations, panels and studies."""
+
+
+Command = (
+    Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
+    | Annotated[Ledger, tyro.conf.subcommand("ledger")]
+    | Annotated[List, tyro.conf.subcommand("list")]
+)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line. Exit code 2 for bad input, 1 for a failed run, 130 for an interrupt."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments in (["--version"], ["-V"]):
+        print(f"uard {__version__}")
+        return
+    command: Any = tyro.cli(Command, prog="uard", args=arguments, description="Rewards that cannot be fully trusted.")
+    from rich.console import Console
+
+    from uard import InvalidValueError
+
+    console = Console(stderr=True, highlight=False)
+    try:
+        from uard.lab.runner import StudyFailedError
+        from uard.lab.store import StoreError
+    except ModuleNotFoundError as error:
+        sys.exit(f"{_NEEDS_LAB} ({error})")
+    try:
+        {Run: _run, Reproduce: _reproduce, Ledger: _ledger, List: _list}[type(command)](command, console)
+    except (InvalidValueError, StoreError) as error:
+        console.print(f"[red]error:[/red] {_escape(str(error))}", soft_wrap=True)
+        sys.exit(2)
+    except StudyFailedError as error:
+        console.print(f"[red]error:[/red] {_escape(str(error))}", soft_wrap=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        console.print("interrupted; every finished cell is stored, the same command goes on from there")
+        sys.exit(130)
+
+
+def _escape(text: str) -> str:
+    from rich.markup import escape
+
+    return escape(text)
+
+
+def _run(command: Run, console: Console) -> None:
+    import time
+
+    from uard import _checks
+    from uard.lab import names
+    from uard.lab.cell import Cell
+    from uard.lab.result import summaries
+    from uard.lab.store import Store
+    from uard.lab.study import results_of
+
+    _checks.whole("seeds", command.seeds, low=1, high=100_000)
+    environment = names.environment(command.environment, names.settings(command.set))
+    noise = command.noise
+    if command.noise_fraction is not None:
+        _checks.number("noise_fraction", command.noise_fraction, low=0)
+        if noise:
+            raise _checks.InvalidValueError("noise", noise, "left out when --noise-fraction is given")
+        noise = command.noise_fraction * abs(environment.trap_reward)
+    cell = Cell(
+        environment,
+        names.mitigation_named(command.mitigation, names.settings(command.set_mitigation, "--set-mitigation")),
+        names.agent(command.agent, names.settings(command.set_agent, "--set-agent")),
+        command.panel,
+        noise,
+        command.rated,
+        command.episodes,
+    )
+    store = Store(command.store or ":memory:")
+    seeds = range(command.seeds)
+    started = time.perf_counter()
+    trained = _train([(cell, s) for s in seeds], store, console, f"training {len(seeds)} seeds")
+    seconds = time.perf_counter() - started
+    results = results_of(cell, store, seeds)
+    metrics = summaries(results)
+    steps = sum(r.steps for r in results)
+    answer = {
+        "metrics": {name: s._asdict() for name, s in metrics.items()},
+        "steps_per_second": round(steps / seconds) if trained == len(seeds) else None,
+        "steps": steps,
+        "noise_as_fraction_of_trap_reward": noise / abs(environment.trap_reward) if environment.trap_reward else None,
+        "seeds": list(seeds),
+        "config": cell.config(),
+        "key": cell.key,
+        "version": __version__,
+    }
+    if command.json is not None:
+        _write_json(answer, command.json)
+    if command.json != "-":
+        from rich.console import Console
+        from rich.table import Table
+
+        title = f"{command.environment} / {command.agent} / {command.mitigation} / {cell.panel}, {len(seeds)} seeds"
+        table = Table("metric", "mean", "sd", "95 % interval", "IQM", title=title)
+        for name, s in metrics.items():
+            interval = f"{s.ci95[0]:.3f} .. {s.ci95[1]:.3f}"
+            table.add_row(name.replace("_", " "), f"{s.mean:.3f}", f"{s.sd:.3f}", interval, f"{s.iqm:.3f}")
+        Console().print(table)
+
+
+def _train(jobs: Any, store: Any, console: Console, what: str, workers: int | None = None) -> int:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    from uard.lab import runner
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task(what, total=None)
+        return runner.run(jobs, store, workers, lambda done, total: bar.update(task, completed=done, total=total))
+
+
+def _write_json(data: Any, target: str) -> None:
+    text = json.dumps(data, indent=2, allow_nan=False)
+    if target == "-":
+        print(text)
+        return
+    from uard import InvalidValueError
+
+    try:
+        Path(target).parent.mkdir(parents=True, exist_ok=True)
+        Path(target).write_text(text + "\n")
+    except OSError as error:
+        raise InvalidValueError("json", target, f"a file that can be written ({error})") from None
+
+
+def _reproduce(command: Reproduce, console: Console) -> None:
+    from uard import InvalidValueError, _checks, studies
+    from uard.lab.store import Store
+
+    _checks.whole("seeds", command.seeds, low=2, high=100_000)
+    chosen = studies.find(command.studies)
+    if command.report and len(chosen) < len(studies.grid()):
+        raise InvalidValueError("report", command.report, "left out unless all grid studies are run")
+    store = Store(command.store)
+    seeds = range(command.seeds)
+    jobs = [job for study in chosen for job in study.jobs(seeds)]
+    trained = _train(jobs, store, console, f"{len(chosen)} studies, {len(set(jobs))} runs", command.workers)
+    console.print(f"{trained} runs trained, {len(set(jobs)) - trained} were in {command.store} already")
+    if command.report:
+        from uard.lab import report
+
+        with console.status("writing the report"):
+            page = report.write(Path(command.report), store, seeds)
+        console.print(f"report: {page}")
+    else:
+        from uard.lab.tables import study_table
+
+        for study in chosen:
+            study_table(study, store, seeds).to_rich(console)
+
+
+def _ledger(command: Ledger, console: Console) -> None:
+    from uard import _checks, studies
+    from uard.lab import ledger
+    from uard.lab.store import Store
+
+    _checks.whole("seeds", command.seeds, low=2, high=100_000)
+    for claim in command.claims:
+        _checks.choose("claim", claim, ledger.CLAIMS)
+    store = Store(command.store)
+    seeds = range(command.seeds)
+    jobs = [job for study in studies.grid() for job in study.jobs(seeds)]
+    _train(jobs, store, console, "what the ledger needs", command.workers)
+    entries = [e for e in ledger.entries(store, seeds) if not command.claims or e.claim in command.claims]
+    if command.json is not None:
+        _write_json(ledger.as_data(entries, seeds), command.json)
+    if command.json != "-":
+        ledger.to_rich(entries)
+
+
+def _list(command: List, console: Console) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from uard import mitigation, studies
+    from uard.envs.panels import PANELS
+    from uard.lab import names
+
+    out = Console()
+    rows: dict[str, dict[str, str]] = {
+        "environments": {k: f"{v.size}x{v.size}, T={v.horizon}, trap {v.trap_reward:+g}" for k, v in names.ENVIRONMENTS.items()},
+        "agents": {k: f"{v.heads} heads, epsilon from {v.epsilon:g}" for k, v in names.AGENTS.items()},
+        "mitigations": {k: str(mitigation.named(k)) for k in mitigation.NAMED},
+        "panels": {k: (v.__doc__ or "").split("\n")[0] for k, v in PANELS.items()},
+        "studies": {s.name: f"{s.title} ({s.answers}; {len(s.rows)} cells)" for s in studies.grid()},
+    }
+    for title, entries in rows.items():
+        table = Table("name", "", title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))
+        for name, text in entries.items():
+            table.add_row(f"[bold]{name}[/bold]", _escape(text))
+        out.print(table)
+        out.print()

@@ -68,7 +68,7 @@ class Usual(NamedTuple):
     Attributes:
         disagreement: Location and deviation of sigma_h.
         scale: Standard deviation of the observed reward, the unit in which sigmas are measured; 1 before any
-            rating.
+            rating and while all observed rewards are equal.
         lowest: Mean of the lowest ratings: what a step is worth at least; 0 before any rating.
     """
 
@@ -117,7 +117,9 @@ def measure_usual(feedback: Feedback, seen: Array, proxy_is_rater: bool) -> Usua
     centre = uncertainty.spread(feedback.proxy, seen).location
     variance = uncertainty.spread((feedback.proxy - centre) * (feedback.proxy - centre), seen).location
     scale = xp.sqrt(variance)
-    scale = xp.where(scale > 0, scale, xp.ones_like(scale))
+    seen_proxy = xp.where(seen, feedback.proxy, xp.zeros_like(feedback.proxy))
+    rounding = xp.finfo(scale.dtype).eps * xp.sum(xp.ones_like(seen_proxy)) * xp.max(xp.abs(seen_proxy))
+    scale = xp.where(scale > rounding, scale, xp.ones_like(scale))
     return Usual(uncertainty.spread(sigma, seen), scale, uncertainty.spread(feedback.lowest, seen).location)
 
 
@@ -231,7 +233,7 @@ class RewardDiscounting(Mitigation):
     filter: ReliabilityFilter = field(default_factory=ReliabilityFilter)
     acts_on: Literal["reward", "score", "both"] = "reward"
     anchor: Literal["zero", "lowest"] = "lowest"
-    kappa: float = 20.0
+    kappa: float = 50.0
     proxy_is_rater: bool = True
     standardise: bool = True
     unrated_weight: float = 0.1
@@ -256,6 +258,7 @@ class RewardDiscounting(Mitigation):
         sigma_h = feedback.spread
         if self.proxy_is_rater:
             sigma_h = uncertainty.with_proxy(feedback.mean, sigma_h, proxy, feedback.raters)
+        sigma_h = _where(feedback.count > 0, sigma_h, 0.0)
         z = adaptation.standing(sigma_h, *usual.disagreement, floor=_DEVIATION_FLOOR * usual.scale)
         lam = adaptation.adaptive_lambda(z, self.filter.lam, self.kappa)
         unit = usual.scale if self.standardise else 1.0

@@ -20,11 +20,12 @@ FORMS: tuple[Form, ...] = ("reciprocal", "exponential", "linear", "certainty-equ
 
 
 def namespace(*arrays: Array) -> Any:
-    """Return the array namespace of the arguments; plain numbers are NumPy's."""
+    """Return the array namespace of the arguments; plain numbers are NumPy's, and NumPy's give way to others."""
     import numpy as np
 
     found = [a for a in arrays if hasattr(a, "shape")]
-    return array_namespace(*found) if found else np
+    others = [a for a in found if not isinstance(a, np.ndarray | np.generic)]
+    return array_namespace(*(others or found)) if found else np
 
 
 def total_uncertainty(sigma_m: Array, sigma_h: Array, alpha: Array = 0.5, beta: Array = 0.5) -> Array:
@@ -150,6 +151,8 @@ class ReliabilityFilter:
             InvalidValueError: for bad sigmas, or a form that needs ``mu`` without it.
         """
         u = total_uncertainty(sigma_m, sigma_h, self.alpha, self.beta)
+        if lam is not None:
+            _checks.nonnegative("lam", lam)
         strength = self.lam if lam is None else lam
         if self.form == "reciprocal":
             return reciprocal_weight(u, strength)

@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from uard import _checks
 
-RESAMPLES = 10_000
+RESAMPLES = 2_000
 
 
 class Summary(NamedTuple):
@@ -115,7 +115,7 @@ def _t_test(a: object, b: object, equal_variances: bool) -> Test:
         return Test(t, float(x.size + y.size - 2), 1.0 if same else 0.0, difference, t)
     from scipy import stats
 
-    result = stats.ttest_ind(x, y, equal_var=equal_variances)
+    result: Any = stats.ttest_ind(x, y, equal_var=equal_variances)
     return Test(float(result.statistic), float(result.df), float(result.pvalue), difference, hedges_g(x, y))
 
 

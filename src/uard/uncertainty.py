@@ -5,6 +5,8 @@ Pure functions of NumPy, JAX or torch arrays. All sigmas carry the unit of the r
 
 from __future__ import annotations
 
+import contextlib
+import math
 import warnings
 from typing import Any, NamedTuple
 
@@ -29,8 +31,9 @@ def sigma_model(values: Array, axis: int = -1, ddof: int = 1) -> Array:
     Raises:
         InvalidValueError: if a value is not finite or there are no more than ``ddof`` members.
     """
+    values = _floats("values", values)
+    _enough("members", values.shape[axis] if values.ndim else 0, ddof)
     _checks.finite("values", values)
-    _enough("members", values.shape[axis], ddof)
     return _std(values, axis, ddof)
 
 
@@ -49,7 +52,8 @@ def sigma_human(
         ddof: 0, the population form, is what the paper's number 1.247 needs ({-1, 2, 1}); its equation (A14)
             prints 1.
         mask: True where a rating exists; same shape. Masked-out entries may hold anything, NaN included.
-        empty: What to return where no more than ``ddof`` ratings exist. Without it such a place is an error.
+        empty: What to return where no more than ``ddof`` ratings exist. Without it such a place is an error (NaN
+            inside a JAX transformation, which can raise none).
 
     Raises:
         InvalidValueError: for NaN, infinity or ``None`` where a rating should be, a mask of another shape, no
@@ -58,8 +62,9 @@ def sigma_human(
     Warns:
         OneAnnotatorWarning: a single annotator never disagrees with itself.
     """
-    if not hasattr(ratings, "shape"):
-        ratings = _checks.as_numpy("ratings", ratings) if mask is None else np.asarray(ratings, dtype=float)
+    if mask is not None and not hasattr(mask, "shape"):
+        mask = _checks.as_numpy("mask", mask)
+    ratings = _floats("ratings", ratings, mask)
     raters = ratings.shape[axis] if ratings.ndim else 0
     if raters == 0:
         raise _checks.InvalidValueError("ratings.shape", tuple(ratings.shape), "at least one annotator on the axis")
@@ -77,8 +82,22 @@ def sigma_human(
                 _enough("annotators", raters, ddof)
             return namespace(ratings).sum(ratings * 0.0, axis=axis) + empty
         return _std(ratings, axis, ddof)
-    _checks.same_shape("mask", mask, "ratings", ratings)
-    return _masked_std(ratings, mask, axis, ddof, empty)
+    xp = namespace(ratings, mask)
+    ratings, here = xp.asarray(ratings), xp.asarray(mask)
+    _checks.same_shape("mask", here, "ratings", ratings)
+    return _masked_std(ratings, here if xp.isdtype(here.dtype, "bool") else here != 0, axis, ddof, empty)
+
+
+def _floats(field: str, values: Array, mask: Array | None = None) -> Array:
+    """Return an array of floats: lists become NumPy's, integers (stars, thumbs) become floats."""
+    if not hasattr(values, "shape") or (isinstance(values, np.ndarray | np.generic) and values.dtype.kind != "f"):
+        if mask is not None:
+            with contextlib.suppress(ValueError):  # rows of unequal length: the check below says so
+                cells = np.asarray(values, dtype=object)
+                values = np.where(mask, cells, 0.0).tolist() if cells.shape == np.shape(mask) else values
+        return _checks.as_numpy(field, values)
+    xp = namespace(values)
+    return values if xp.isdtype(values.dtype, "real floating") else xp.astype(values, xp.asarray(0.0).dtype)
 
 
 def _std(values: Array, axis: int, ddof: int) -> Array:
@@ -92,7 +111,7 @@ def _masked_std(ratings: Array, mask: Array, axis: int, ddof: int, empty: float 
     xp = namespace(ratings)
     values = xp.where(mask, ratings, xp.zeros_like(ratings))
     _checks.finite("ratings", values)
-    here = xp.astype(mask, ratings.dtype) if hasattr(xp, "astype") else mask.astype(ratings.dtype)
+    here = xp.astype(mask, ratings.dtype)
     count = xp.sum(here, axis=axis, keepdims=True)
     few = count <= ddof
     if empty is None and not _checks.is_traced(few) and bool(xp.any(few)):
@@ -103,7 +122,7 @@ def _masked_std(ratings: Array, mask: Array, axis: int, ddof: int, empty: float 
     centre = xp.sum(values, axis=axis, keepdims=True) / xp.where(count > 0, count, one)
     square = xp.where(mask, (values - centre) * (values - centre), xp.zeros_like(values))
     variance = xp.sum(square, axis=axis, keepdims=True) / xp.where(few, one, count - ddof)
-    sigma = xp.where(few, one * (0.0 if empty is None else empty), xp.sqrt(variance))
+    sigma = xp.where(few, one * (math.nan if empty is None else empty), xp.sqrt(variance))
     return xp.squeeze(sigma, axis=axis)
 
 
@@ -134,17 +153,18 @@ def shrink(sigma: Array, count: Array, prior: Array, strength: Array = 1.0) -> A
     """(n sigma + n0 prior) / (n + n0): a deviation from few ratings, drawn towards what is usual.
 
     Args:
-        sigma: Estimate from ``count`` rated visits.
+        sigma: Estimate from ``count`` rated visits; means nothing (may be NaN) where that is 0.
         count: Number of rated visits n >= 0.
         prior: What is usual, e.g. the mean over all state-actions.
         strength: Pseudo-count n0 >= 0; with n0 = 0 nothing is shrunk (and n = 0 gives the prior).
     """
     total = count + strength
     if not hasattr(total, "shape"):
-        return prior if total == 0 else (count * sigma + strength * prior) / total
-    xp = namespace(total)
+        return prior if count == 0 else (count * sigma + strength * prior) / total
+    xp = namespace(total, sigma)
     safe = xp.where(total > 0, total, xp.ones_like(total))
-    return xp.where(total > 0, (count * sigma + strength * prior) / safe, prior + 0.0 * total)
+    heard = xp.where(count + 0.0 * total > 0, count * sigma, xp.zeros_like(total))
+    return xp.where(total > 0, (heard + strength * prior) / safe, prior + 0.0 * total)
 
 
 class Spread(NamedTuple):
@@ -175,7 +195,10 @@ def ratings_from(rows: Any) -> tuple[np.ndarray, np.ndarray]:
         InvalidValueError: rows of unequal length, or an entry that is neither a finite number nor ``None``;
             the message names row and column.
     """
-    table = [list(row) for row in rows]
+    try:
+        table = [list(row) for row in rows]
+    except TypeError:
+        raise _checks.InvalidValueError("ratings", rows, "a list of rows, one rating per annotator in each") from None
     width = len(table[0]) if table else 0
     ratings, mask = np.zeros((len(table), width)), np.zeros((len(table), width), dtype=bool)
     for i, row in enumerate(table):
@@ -184,6 +207,10 @@ def ratings_from(rows: Any) -> tuple[np.ndarray, np.ndarray]:
         for j, entry in enumerate(row):
             if entry is None:
                 continue
-            _checks.number(f"ratings[{i}, {j}]", entry)
+            try:
+                _checks.number("", entry)
+            except _checks.InvalidValueError:
+                allowed = "a finite number, or None where a rating is missing"
+                raise _checks.InvalidValueError(f"ratings[{i}, {j}]", entry, allowed) from None
             ratings[i, j], mask[i, j] = entry, True
     return ratings, mask

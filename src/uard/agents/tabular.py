@@ -41,7 +41,7 @@ class QLearning:
     epsilon_decay: float = 0.995
     epsilon_min: float = 0.05
     bootstrap: float = 1.0
-    init_scale: float = 1.0
+    init_scale: float = 0.1
     abstention: Abstention | None = None
 
     def __post_init__(self) -> None:

@@ -1,1 +1,5 @@
-"""Environments and the panels that rate them."""
+"""Environments and the panels that rate them; importing this registers the ids ``uard/...`` with Gymnasium."""
+
+from uard.envs.gym import register
+
+register()

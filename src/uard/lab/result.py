@@ -66,7 +66,8 @@ class Result:
     def pack(self) -> tuple[bytes, str]:
         """Return the bytes to store and their checksum."""
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, log=self.log, steps=self.steps, path=self.path.astype(np.int32), **self.extra)
+        arrays: dict[str, Any] = {"log": self.log, "steps": self.steps, "path": self.path.astype(np.int32), **self.extra}
+        np.savez_compressed(buffer, **arrays)
         data = buffer.getvalue()
         return data, hashlib.sha256(data).hexdigest()
 

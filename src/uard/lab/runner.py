@@ -149,8 +149,11 @@ def _work(pipe: Connection, core: int | None) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     if core is not None:
         os.sched_setaffinity(0, {core})
-    while (batch := pipe.recv()) is not None:
-        pipe.send(_attempt(batch))
+    try:
+        while True:
+            pipe.send(_attempt(pipe.recv()))
+    except (EOFError, BrokenPipeError):
+        return  # the parent is done, or gone
 
 
 def _spread(queue: list[list[Job]], workers: int) -> Outcomes:
@@ -202,6 +205,7 @@ def _spread(queue: list[list[Job]], workers: int) -> Outcomes:
     finally:
         for pipe, process in pipes.items():
             pipe.close()
-            process.terminate()
+            if busy:
+                process.terminate()
         for process in pipes.values():
             process.join()

@@ -1,0 +1,99 @@
+"""Names that the command line and studies use, and how ``--set`` changes what they stand for."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+from uard import _checks, mitigation
+from uard.agents.tabular import QLearning
+from uard.envs.panels import PANELS
+from uard.envs.trapgrid import TrapGrid
+from uard.mitigation import Mitigation
+
+ENVIRONMENTS: dict[str, TrapGrid] = {
+    "TrapGrid": TrapGrid(),
+    **{f"TrapGrid{n}": TrapGrid(size=n) for n in (6, 8, 10)},
+    **{f"TrapGrid{n}-Trap8": TrapGrid(size=n, trap_reward=8.0) for n in (6, 8, 10)},
+    **{f"TrapGrid{n}-Legitimate": TrapGrid(size=n, legitimate=True) for n in (6, 8, 10)},
+    "TrapGrid10-T100": TrapGrid(size=10, horizon=100),
+}
+AGENTS: dict[str, QLearning] = {"q-learning": QLearning(), "random-walk": QLearning(1, 0.1, 0.95, 1.0, 1.0, 1.0)}
+
+
+def settings(pairs: tuple[str, ...], option: str = "--set") -> dict[str, Any]:
+    """Read ``name=value`` pairs; values are JSON, or else text.
+
+    Raises:
+        InvalidValueError: a pair without ``=``.
+    """
+    out: dict[str, Any] = {}
+    for pair in pairs:
+        name, sign, value = pair.partition("=")
+        if not sign or not name:
+            raise _checks.InvalidValueError(option, pair, "name=value, such as size=12 or 'traps=[[2,5],[7,3]]'")
+        try:
+            out[name] = json.loads(value)
+        except json.JSONDecodeError:
+            out[name] = value
+    return out
+
+
+def changed(base: Any, changes: dict[str, Any], what: str) -> Any:
+    """Return a frozen dataclass with some fields changed; nested ones by dotted names.
+
+    Raises:
+        UnknownNameError: an unknown field, with the nearest known one.
+    """
+    fields = {f.name: f for f in dataclasses.fields(base) if f.init}
+    given: dict[str, Any] = {}
+    for name, value in changes.items():
+        head, _, rest = name.partition(".")
+        if head not in fields:
+            raise _checks.UnknownNameError(f"{what} setting", name, fields)
+        if rest:
+            value = changed(given.get(head, getattr(base, head)), {rest: value}, f"{what}.{head}")
+        elif isinstance(getattr(base, head), float) and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        elif isinstance(value, list):
+            value = tuple(tuple(v) if isinstance(v, list) else v for v in value)
+        given[head] = value
+    return dataclasses.replace(base, **given)
+
+
+def environment(name: str, changes: dict[str, Any]) -> TrapGrid:
+    """Return an environment by name. A new size, unless more is said, brings its own traps, goal and horizon."""
+    base = ENVIRONMENTS[_checks.choose("environment", name, ENVIRONMENTS)]
+    if changes.get("size", base.size) != base.size:
+        base = TrapGrid(trap_reward=base.trap_reward, legitimate=base.legitimate)
+        base = _bare(base)
+    return changed(base, changes, "environment")
+
+
+def _bare(grid: TrapGrid) -> TrapGrid:
+    """Undo what the constructor filled in from the size."""
+    copy = object.__new__(TrapGrid)
+    for f in dataclasses.fields(TrapGrid):
+        keep = f.name not in ("traps", "goal", "horizon", "size")
+        object.__setattr__(copy, f.name, getattr(grid, f.name) if keep else f.default)
+    return copy
+
+
+def agent(name: str, changes: dict[str, Any]) -> QLearning:
+    """Return an agent by name, some fields changed."""
+    return changed(AGENTS[_checks.choose("agent", name, AGENTS)], changes, "agent")
+
+
+def mitigation_named(name: str, changes: dict[str, Any]) -> Mitigation:
+    """Return a mitigation by name, some fields changed (``filter.lam`` and the like for the filter's)."""
+    base = mitigation.named(name)
+    short = {"lam", "alpha", "beta", "form"}
+    full = {f"filter.{k}" if k in short and hasattr(base, "filter") else k: v for k, v in changes.items()}
+    return changed(base, full, "mitigation")
+
+
+def panel(name: str) -> str:
+    """Return a panel's name if there is one."""
+    return _checks.choose("panel", name, PANELS)
+

@@ -1,0 +1,76 @@
+"""A study as data: named rows, each a cell; the seeds are added when it is run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from uard.lab.cell import Cell
+from uard.lab.result import Result
+from uard.lab.store import Store
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a study: what tells it from the others, and the cell behind it."""
+
+    labels: tuple[tuple[str, Any], ...]
+    cell: Cell
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a label."""
+        return dict(self.labels)[name]
+
+
+def row(cell: Cell, **labels: Any) -> Row:
+    """Build a row."""
+    return Row(tuple(labels.items()), cell)
+
+
+@dataclass(frozen=True)
+class Study:
+    """An experiment: a question, what of the paper it answers, and its rows.
+
+    Attributes:
+        name: As on the command line.
+        title: One line.
+        answers: Inventory numbers (F2, H5, G3 ...).
+        rows: Its cells with their labels.
+    """
+
+    name: str
+    title: str
+    answers: str
+    rows: tuple[Row, ...]
+
+    def jobs(self, seeds: Iterable[int]) -> list[tuple[Cell, int]]:
+        """Return every (cell, seed), seeds outermost last so that a cell finishes as a whole."""
+        seeds = list(seeds)
+        return [(r.cell, seed) for r in self.rows for seed in seeds]
+
+    def where(self, **labels: Any) -> Iterator[Row]:
+        """Yield the rows that have all these labels."""
+        for r in self.rows:
+            have = dict(r.labels)
+            if all(name in have and have[name] == value for name, value in labels.items()):
+                yield r
+
+    def one(self, **labels: Any) -> Row:
+        """Return the only row with these labels."""
+        (found,) = self.where(**labels)
+        return found
+
+
+def results_of(cell: Cell, store: Store, seeds: Iterable[int]) -> list[Result]:
+    """Return the results of all seeds, in their order.
+
+    Raises:
+        LookupError: some are not in the store.
+    """
+    seeds = list(seeds)
+    found = store.get(cell, seeds)
+    lost = [s for s in seeds if s not in found]
+    if lost:
+        raise LookupError(f"seeds {lost} of this cell are not in the store {store.path!r}; run it again: {cell}")
+    return [found[s] for s in seeds]
