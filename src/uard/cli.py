@@ -1,4 +1,4 @@
-"""The command line: ``uard run``, ``reproduce``, ``ledger``, ``list``. Imports what a command needs, when it needs it."""
+"""The command line: ``uard run``, ``reproduce``, ``ledger``, ``list``. A command imports what it needs when it runs."""
 
 from __future__ import annotations
 
@@ -204,11 +204,24 @@ def _run(command: Run, console: Console) -> None:
 
 
 def _train(jobs: Any, store: Any, console: Console, what: str, workers: int | None = None) -> int:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     from uard.lab import runner
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=console) as bar:
         task = bar.add_task(what, total=None)
         return runner.run(jobs, store, workers, lambda done, total: bar.update(task, completed=done, total=total))
@@ -248,15 +261,20 @@ def _reproduce(command: Reproduce, console: Console) -> None:
             page = report.write(Path(command.report), store, seeds)
         console.print(f"report: {page}")
     else:
+        from rich.console import Console
+
+        from uard.lab.evidence import Evidence
         from uard.lab.tables import study_table
 
+        evidence = Evidence(store, seeds, chosen)
         for study in chosen:
-            study_table(study, store, seeds).to_rich(console)
+            study_table(study, evidence).to_rich(Console())
 
 
 def _ledger(command: Ledger, console: Console) -> None:
     from uard import _checks, studies
     from uard.lab import ledger
+    from uard.lab.evidence import Evidence
     from uard.lab.store import Store
 
     _checks.whole("seeds", command.seeds, low=2, high=100_000)
@@ -266,7 +284,8 @@ def _ledger(command: Ledger, console: Console) -> None:
     seeds = range(command.seeds)
     jobs = [job for study in studies.grid() for job in study.jobs(seeds)]
     _train(jobs, store, console, "what the ledger needs", command.workers)
-    entries = [e for e in ledger.entries(store, seeds) if not command.claims or e.claim in command.claims]
+    evidence = Evidence(store, seeds, studies.grid())
+    entries = [e for e in ledger.entries(evidence) if not command.claims or e.claim in command.claims]
     if command.json is not None:
         _write_json(ledger.as_data(entries, seeds), command.json)
     if command.json != "-":
@@ -283,7 +302,9 @@ def _list(command: List, console: Console) -> None:
 
     out = Console()
     rows: dict[str, dict[str, str]] = {
-        "environments": {k: f"{v.size}x{v.size}, T={v.horizon}, trap {v.trap_reward:+g}" for k, v in names.ENVIRONMENTS.items()},
+        "environments": {
+            k: f"{v.size}x{v.size}, T={v.horizon}, trap {v.trap_reward:+g}" for k, v in names.ENVIRONMENTS.items()
+        },
         "agents": {k: f"{v.heads} heads, epsilon from {v.epsilon:g}" for k, v in names.AGENTS.items()},
         "mitigations": {k: str(mitigation.named(k)) for k in mitigation.NAMED},
         "panels": {k: (v.__doc__ or "").split("\n")[0] for k, v in PANELS.items()},

@@ -237,7 +237,7 @@ class RewardDiscounting(Mitigation):
     proxy_is_rater: bool = True
     standardise: bool = True
     unrated_weight: float = 0.1
-    prior_count: float = 1.0
+    prior_count: float = 2.0
     backup: Backup = "greedy"
 
     def __post_init__(self) -> None:

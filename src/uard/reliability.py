@@ -69,9 +69,8 @@ def linear_weight(u: Array, mu: Array, lam: Array = 2.0) -> Array:
     """
     mu = _as_array_like(u, mu)
     xp = namespace(mu)
-    positive = mu > 0
-    ratio = 1.0 - lam * u / xp.where(positive, mu, xp.ones_like(mu))
-    return xp.where(positive, xp.clip(ratio, 0.0, 1.0), xp.zeros_like(ratio))
+    left = xp.maximum(mu - lam * u, xp.zeros_like(mu))
+    return left / xp.where(mu > 0, mu, xp.ones_like(mu))
 
 
 def certainty_equivalent_weight(u: Array, mu: Array, kappa: Array = 2.0) -> Array:
@@ -82,10 +81,8 @@ def certainty_equivalent_weight(u: Array, mu: Array, kappa: Array = 2.0) -> Arra
     """
     mu = _as_array_like(u, mu)
     xp = namespace(mu)
-    positive = mu > 0
-    safe = xp.where(positive, mu, xp.ones_like(mu))
-    weight = 1.0 / (1.0 + kappa * u * u / (2.0 * safe))
-    return xp.where(positive, weight, xp.zeros_like(weight))
+    safe = xp.where(mu > 0, mu, xp.ones_like(mu))
+    return 2.0 * xp.maximum(mu, xp.zeros_like(mu)) / (2.0 * safe + kappa * u * u)
 
 
 def wiener_weight(signal: Array, noise: Array) -> Array:

@@ -96,4 +96,3 @@ def mitigation_named(name: str, changes: dict[str, Any]) -> Mitigation:
 def panel(name: str) -> str:
     """Return a panel's name if there is one."""
     return _checks.choose("panel", name, PANELS)
-

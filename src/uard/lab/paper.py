@@ -115,6 +115,19 @@ TABLE_5 = (
 )
 
 
+BASELINES = {
+    "DQN": ("F3",),
+    "Ensemble-DQN": (),
+    "CQL": ("F3",),
+    "CPO": ("F3",),
+    "TRPO": ("F3",),
+    "SAC": ("G6", "G7", "G11"),
+    "EDAC": ("G14",),
+    "SUNRISE": ("G15",),
+    "PPO": ("G6", "G7", "G11", "G13"),
+}  # line 49: the nine, and the tables and figures in which each is named; G16 names none but "all baselines"
+
+
 class Hyperparameter(NamedTuple):
     """A row of Table 6 (F6), as printed."""
 
@@ -274,7 +287,7 @@ CLAIMS = {
     "J2": Claim(420, "Proposition 2: J is strictly decreasing in sigma_m and sigma_h for mu > 0."),
     "J3": Claim(440, "The filter consistently penalises higher uncertainty regardless of the magnitude of mu."),
     "J4": Claim(396, "The reciprocal form discounts smoothly and does not over-penalise early exploration."),
-    "J5": Claim(473, "Theorem 1: T_lambda is a gamma-contraction in the maximum norm."),
+    "J5": Claim(478, "Theorem 1: T_lambda is a gamma-contraction in the maximum norm."),
     "J6": Claim(500, "T_lambda has a unique fixed point, and iteration converges to it from any start."),
     "J7": Claim(508, "At the fixed point, discounting prevents over-optimisation of misspecified rewards."),
     "J8": Claim(511, "The filter trades bias for variance, controlled by alpha_m and alpha_h."),
@@ -283,7 +296,7 @@ CLAIMS = {
     "J11": Claim(525, "The reciprocal form emerges naturally from uncertainty-aware utility maximisation."),
     "J12": Claim(645, "The filter can be read as a Wiener filter and through the Information Bottleneck."),
     "J13": Claim(868, "The reciprocal filter preserves informative gradients under high uncertainty."),
-    "J14": Claim(839, "Linear subtraction collapses abruptly; exponential decay suppresses too much."),
+    "J14": Claim(840, "Linear subtraction collapses abruptly; exponential decay suppresses too much."),
     "J15": Claim(39, "UARD needs no ground-truth reward and no change of the environment."),
     "J16": Claim(51, "UARD reduces hacking by up to 93.6 % across grids and MuJoCo."),
     "J17": Claim(1149, "Trap visits on 6x6 fall by about 93.7 % against the baseline."),

@@ -66,7 +66,12 @@ class Result:
     def pack(self) -> tuple[bytes, str]:
         """Return the bytes to store and their checksum."""
         buffer = io.BytesIO()
-        arrays: dict[str, Any] = {"log": self.log, "steps": self.steps, "path": self.path.astype(np.int32), **self.extra}
+        arrays: dict[str, Any] = {
+            "log": self.log,
+            "steps": self.steps,
+            "path": self.path.astype(np.int32),
+            **self.extra,
+        }
         np.savez_compressed(buffer, **arrays)
         data = buffer.getvalue()
         return data, hashlib.sha256(data).hexdigest()
@@ -100,9 +105,7 @@ def read_feedback(rows: np.ndarray, raters: int) -> Feedback:
     return Feedback(count, mean, lowest, spread, proxy, np.float32(raters))
 
 
-def greedy_path(
-    task: Task, agent: QLearning, mitigation: Mitigation, q: np.ndarray, feedback: Feedback
-) -> np.ndarray:
+def greedy_path(task: Task, agent: QLearning, mitigation: Mitigation, q: np.ndarray, feedback: Feedback) -> np.ndarray:
     """Return the states that the trained agent visits without exploring, the start included."""
     usual = mitigation.usual(feedback, feedback.count > 0)
     mu = q.mean(-1)

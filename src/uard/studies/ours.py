@@ -1,4 +1,4 @@
-"""Our own grid studies: every mitigation everywhere, controls that the method should fail, few ratings, unseen grids."""
+"""Our own grid studies: every mitigation everywhere, should-fail controls, few ratings, unseen grids."""
 
 from __future__ import annotations
 
