@@ -255,16 +255,16 @@ def _reproduce(command: Reproduce, console: Console) -> None:
     trained = _train(jobs, store, console, f"{len(chosen)} studies, {len(set(jobs))} runs", command.workers)
     console.print(f"{trained} runs trained, {len(set(jobs)) - trained} were in {command.store} already")
     if command.report:
-        from uard.lab import report
+        from uard.reporting import page
 
         with console.status("writing the report"):
-            page = report.write(Path(command.report), store, seeds)
-        console.print(f"report: {page}")
+            written = page.write(Path(command.report), store, seeds)
+        console.print(f"report: {written}")
     else:
         from rich.console import Console
 
-        from uard.lab.evidence import Evidence
-        from uard.lab.tables import study_table
+        from uard.reporting.evidence import Evidence
+        from uard.reporting.tables import study_table
 
         evidence = Evidence(store, seeds, chosen)
         for study in chosen:
@@ -273,9 +273,9 @@ def _reproduce(command: Reproduce, console: Console) -> None:
 
 def _ledger(command: Ledger, console: Console) -> None:
     from uard import _checks, studies
-    from uard.lab import ledger
-    from uard.lab.evidence import Evidence
     from uard.lab.store import Store
+    from uard.reporting import ledger
+    from uard.reporting.evidence import Evidence
 
     _checks.whole("seeds", command.seeds, low=2, high=100_000)
     for claim in command.claims:

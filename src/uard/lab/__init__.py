@@ -1,1 +1,1 @@
-"""The laboratory: studies as data, their store, statistics, ledger and report."""
+"""The laboratory: a study as data, its cells, their results, the store and the runner."""

@@ -193,6 +193,8 @@ def run(one: Lane, program: Program) -> Outcome:
     def one_step(c: _Carry, draws: Any) -> tuple[_Carry, None]:
         own, noise, rated = draws
         action, sigma_m, abstained = choose(c, own.explore, own.action)
+        if listens:
+            action, sigma_m = lax.optimization_barrier((action, sigma_m))
         state2, reward, terminated, truncated = step(task, c.state, c.time, action)
         place = c.state * actions + action
         active = (c.episode < program.episodes).astype(jnp.float32)
@@ -220,7 +222,7 @@ def run(one: Lane, program: Program) -> Outcome:
         else:
             mu2, sigma2 = tabular.mean_and_deviation(following)
             best2 = jnp.argmax(mitigation.score(mu2, sigma2, heard(at(feedback, state2)), c.usual))
-            value = at(following, best2)
+            value = at(following, lax.optimization_barrier(best2))
         target = signal.reward + jnp.where(terminated, 0.0, agent.gamma * value)
         rate = agent.learning_rate * active * signal.sample_weight * own.mask
         if skips:

@@ -12,10 +12,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from uard.lab import paper, theory
-from uard.lab.evidence import Evidence
 from uard.lab.study import Row
 from uard.reliability import exponential_weight, linear_weight, reciprocal_weight
+from uard.reporting import paper, theory
+from uard.reporting.evidence import Evidence
 from uard.stability import DEFINITIONS, perturbed_advantage
 
 matplotlib.use("Agg")
@@ -33,7 +33,7 @@ COLOURS = {
     "lcb": "#d6589f",
     "screening": "#999933",
 }
-_STYLE: dict[str, Any] = {
+_STYLE: Any = {
     "font.size": 11,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -272,7 +272,7 @@ def walks(e: Evidence) -> Figure:
         path = e.results(cell)[0].path
         grid = cell.environment
         counts = np.bincount(path, minlength=grid.states).reshape(grid.size, grid.size)
-        axis.imshow(np.where(counts > 0, np.log1p(counts), np.nan), cmap="Blues", vmin=0, vmax=np.log1p(40))
+        axis.imshow(np.where(counts > 0, np.log1p(counts), np.nan), cmap="Blues", vmin=0, vmax=np.log1p(900))
         rows, columns = np.divmod(path, grid.size)
         axis.plot(columns, rows, color=COLOURS[agent], lw=1.5)
         for trap in grid.traps or ():
@@ -283,7 +283,7 @@ def walks(e: Evidence) -> Figure:
         axis.text(0, 0, "start", ha="center", va="center", fontsize=8)
         for (r, c), n in np.ndenumerate(counts):
             if n > 1:
-                axis.text(c, r + 0.33, f"{n}x", ha="center", va="center", fontsize=8)
+                axis.text(c, r + 0.3, f"{n}x", ha="center", va="center", fontsize=10, weight="bold")
         axis.set_xticks(np.arange(-0.5, grid.size), [])
         axis.set_yticks(np.arange(-0.5, grid.size), [])
         axis.tick_params(length=0)

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from uard import InvalidValueError, __version__, statistics, studies
-from uard.lab import audit, figures, ledger, paper, theory
-from uard.lab.evidence import Evidence
 from uard.lab.result import CALIBRATION, WINDOW
 from uard.lab.store import Store
 from uard.lab.study import Row
-from uard.lab.tables import Table, brief, full, number, study_table
+from uard.reporting import audit, figures, ledger, paper, theory
+from uard.reporting.evidence import Evidence
+from uard.reporting.tables import Table, brief, full, number, study_table
 from uard.statistics import Summary
 
 _PACKAGES = ("jax", "numpy", "scipy", "gymnasium", "matplotlib")
@@ -38,7 +38,7 @@ def write(folder: Path, store: Store, seeds: Sequence[int]) -> Path:
     entries = ledger.entries(evidence)
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    page = environment.get_template("report.html.j2").render(
+    page = environment.get_template("page.html.j2").render(
         version=__version__,
         seeds=len(evidence.seeds),
         window=WINDOW,
@@ -94,7 +94,7 @@ def _losses(e: Evidence) -> list[str]:
     worst = min(e.of(r.cell, "trap_visits").mean / e.of(r.cell, "episode_length").mean for r in fooled)
     out.append(
         f"Colluding raters (all repeat the proxy): uard hacks in {len(fooled)} of {len(fooled)} settings, at least "
-        f"{worst:.2f} trap visits per step. Nothing that listens to those raters can do better; this control must fail."
+        f"{worst:.2f} trap visits per step. It reads agreement as truth; this control must fail, and does."
     )
     target = [
         r
@@ -113,7 +113,7 @@ def _losses(e: Evidence) -> list[str]:
     )
     for study, shown in (("matrix", ("size", "trap", "panel", "noise")), ("budgets", ("panel", "noise", "rated"))):
         beaten = []
-        rows = [r for r in e.studies[study].where(mitigation="uard") if r["panel"] != "colluding"]
+        rows = list(e.studies[study].where(mitigation="uard"))
         for r in rows:
             labels = {k: r[k] for k in shown}
             mine = e.of(r.cell, "true_return")
@@ -174,7 +174,7 @@ def _film(e: Evidence) -> list[dict[str, Any]]:
 
 def _check(c: audit.Check) -> dict[str, str]:
     def text(values: Any) -> str:
-        shown = ((k, number(v) if isinstance(v, float | int) else v) for k, v in values.items() if v is not None)
+        shown = ((k, f"{v:.4g}" if isinstance(v, float | int) else v) for k, v in values.items() if v is not None)
         return "; ".join(f"{k}: {v}" for k, v in shown) or "–"
 
     return {
@@ -263,7 +263,7 @@ def _paper_tables(e: Evidence) -> list[Table]:
         ("variant", "paper", "as printed (acts on J)", "consistent backup", "T_lambda (on reward)", "ours (uard)"),
         tuple(rows5),
         1,
-        "Trap visits per episode, 6x6, main panel, heads bootstrapped with probability 0.5. Without sigma_h nothing works, under any reading.",
+        "Trap visits per episode, 6x6, main panel, heads bootstrapped with probability 0.5. Without sigma_h no reading of the paper works. Ours then still has its anchor and lambda_t, which come from the ratings too.",
     )
     return [table2, table3, table4, table5]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from uard.lab.evidence import Evidence
 from uard.lab.study import Study
+from uard.reporting.evidence import Evidence
 from uard.statistics import Summary
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """Every number that the paper prints about its tables, its grids and its figures, typed in once, with its tex line.
 
 Rows are frozen; a ``Stat`` is the paper's "mean +- SD over 10 seeds". Ids (F2, G4, I1, J16...) are those of
-``paper/inventory.md``. Nothing is computed here: what follows from these numbers is in ``uard.lab.audit``.
+``paper/inventory.md``. Nothing is computed here: what follows from these numbers is in ``uard.reporting.audit``.
 """
 
 from __future__ import annotations

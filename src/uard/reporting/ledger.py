@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from uard import __version__, statistics
-from uard.lab import paper, theory
-from uard.lab.evidence import Evidence
-from uard.lab.tables import full, number
 from uard.reliability import ReliabilityFilter, reciprocal_weight, wiener_weight
+from uard.reporting import paper, theory
+from uard.reporting.evidence import Evidence
+from uard.reporting.tables import full, number
 from uard.statistics import Summary
 
 VERDICTS = HOLDS, IN_PART, FAILS, UNTESTABLE = "holds", "holds in part", "does not hold", "cannot be tested"
@@ -428,7 +428,8 @@ def _j13(e: Evidence) -> _Answer:
     exponential, reciprocal = slopes(x)
     from scipy.optimize import brentq
 
-    crossing = float(brentq(lambda z: slopes(z)[0] - slopes(z)[1], 1.0, 5.0))
+    root: Any = brentq(lambda z: slopes(z)[0] - slopes(z)[1], 1.0, 5.0)
+    crossing = float(root)
     why = f"Only above lambda U = {crossing:.3f}. At the paper's own trap (lambda U = {x:.3f}) the exponential filter has the larger slope."
     return (
         "slopes of both filters (G2)",

@@ -11,8 +11,8 @@ from uard import bellman
 from uard.envs.panels import ratings
 from uard.envs.tabular import Task
 from uard.envs.trapgrid import PAPER_TRAPS, paper_grid
-from uard.lab import paper
 from uard.reliability import reciprocal_weight
+from uard.reporting import paper
 from uard.stability import DEFINITIONS, Definition, sign_preservation_radius
 
 

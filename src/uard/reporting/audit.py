@@ -1,6 +1,6 @@
 """The paper's arithmetic, recomputed: what its own numbers imply, and where they contradict each other.
 
-Every number comes from ``uard.lab.paper`` or is computed here, exactly where that is possible (value iteration, Markov
+Every number comes from ``uard.reporting.paper`` or is computed here, exactly where that is possible (value iteration, Markov
 chains, quadrature). One function per section of ``paper/audit.md``; ``run`` does all in a few seconds.
 """
 
@@ -18,9 +18,9 @@ from scipy import stats
 from uard import bellman
 from uard.envs.tabular import Task
 from uard.envs.trapgrid import TrapGrid, paper_grid
-from uard.lab import paper
-from uard.lab.paper import Stat
 from uard.reliability import Form, reciprocal_weight
+from uard.reporting import paper
+from uard.reporting.paper import Stat
 from uard.stability import sign_preservation_radius
 
 Values = dict[str, float | str | None]
@@ -68,39 +68,29 @@ def episode_outcome(grid: TrapGrid, policy: np.ndarray, epsilon: np.ndarray | fl
         policy: (S, A) action probabilities of the greedy part.
         epsilon: (P,) probabilities in [0, 1] of a uniformly random action; one policy per entry.
     """
-    task, hack = grid.task(), np.asarray(grid.truth().hack, float)
-    eps = np.atleast_1d(np.asarray(epsilon, float))[:, None]
-    goes_on = np.where(task.terminal, 0.0, 1.0)
-    count, actions = task.reward.shape
-    rows = np.repeat(np.arange(count), actions)
-
-    def blocks(mass: np.ndarray) -> list[np.ndarray]:
-        """Transposed transition matrices under the two parts of the policy, each step weighted with ``mass``."""
-        out = []
-        for part in (policy, np.full_like(policy, 1.0 / actions)):
-            matrix = np.zeros((count, count))
-            np.add.at(matrix, (task.next_state.ravel(), rows), (part * mass * goes_on).ravel())
-            out.append(matrix)
-        return out
-
-    def now(table: np.ndarray) -> np.ndarray:
-        return (1.0 - eps) * (policy * table).sum(1) + eps * table.mean(1)
-
-    step, onto_hack = np.hstack(blocks(np.ones_like(hack))), np.hstack(blocks(hack))
-
-    def ahead(values: np.ndarray, matrices: np.ndarray) -> np.ndarray:
-        both = values @ matrices
-        return (1.0 - eps) * both[:, :count] + eps * both[:, count:]
-
-    first = second = goal = total = np.zeros((len(eps), count))
-    at_once = [now(np.asarray(x, float)) for x in (hack, task.terminal, task.reward)]
+    task = grid.task()
+    eps = np.atleast_1d(np.asarray(epsilon, float))
+    share = 1.0 / policy.shape[1]
+    steps = [
+        (
+            (1.0 - eps) * policy[:, [a]] + eps * share,
+            task.next_state[:, a],
+            *(np.asarray(table, float)[:, [a]] for table in (~task.terminal, grid.truth().hack, task.reward)),
+        )
+        for a in range(policy.shape[1])
+    ]
+    first = second = goal = total = np.zeros((len(policy), len(eps)))
     for _ in range(int(task.horizon)):
-        second = at_once[0] + 2.0 * ahead(first, onto_hack) + ahead(second, step)
-        first = at_once[0] + ahead(first, step)
-        goal = at_once[1] + ahead(goal, step)
-        total = at_once[2] + ahead(total, step)
+        now = [0.0, 0.0, 0.0, 0.0]
+        for chance, entered, goes_on, hack, reward in steps:
+            onwards = goes_on * first[entered]
+            now[0] += chance * (hack + onwards)
+            now[1] += chance * (hack * (1.0 + 2.0 * onwards) + goes_on * second[entered])
+            now[2] += chance * (1.0 - goes_on + goes_on * goal[entered])
+            now[3] += chance * (reward + goes_on * total[entered])
+        first, second, goal, total = (np.asarray(x) for x in now)
     s = int(task.start)
-    return Outcome(first[:, s], (second - first**2)[:, s], goal[:, s], total[:, s])
+    return Outcome(first[s], second[s] - first[s] ** 2, goal[s], total[s])
 
 
 def most_visits(grid: TrapGrid) -> int:
