@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,6 +64,8 @@ def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
     """Mean of the middle half (the outer quarters trimmed, with fractional weight at the edges)."""
     x = np.sort(np.moveaxis(np.asarray(values, float), axis, -1), axis=-1)
     n = x.shape[-1]
+    if n == 0:
+        raise _checks.InvalidValueError("values.shape", x.shape, "at least one number along the axis")
     edges = np.clip(np.arange(1, n + 1) - n / 4, 0, 1) - np.clip(np.arange(1, n + 1) - 3 * n / 4, 0, 1)
     return (x * edges).sum(-1) / edges.sum()
 
@@ -89,7 +91,9 @@ def summarise(values: Sequence[float] | np.ndarray, field: str = "values") -> Su
 
 
 def _sample(field: str, values: object, least: int = 2) -> np.ndarray:
-    x = _checks.as_numpy(field, values).ravel()
+    x = np.atleast_1d(_checks.as_numpy(field, values))
+    if x.ndim > 1:
+        raise _checks.InvalidValueError(f"{field}.shape", x.shape, "(n,): one number per seed")
     _checks.finite(field, x)
     if x.size < least:
         raise _checks.InvalidValueError(f"{field}.size", x.size, f">= {least} (one number per seed)")
@@ -108,23 +112,36 @@ def student(a: object, b: object) -> Test:
 
 def _t_test(a: object, b: object, equal_variances: bool) -> Test:
     x, y = _sample("a", a), _sample("b", b)
-    difference = float(x.mean() - y.mean())
-    if x.std() == 0 and y.std() == 0:
-        same = difference == 0
-        t = 0.0 if same else math.copysign(math.inf, difference)
-        return Test(t, float(x.size + y.size - 2), 1.0 if same else 0.0, difference, t)
-    from scipy import stats
+    mean_x, part_x = _mean_and_variance(x)
+    mean_y, part_y = _mean_and_variance(y)
+    difference, df = mean_x - mean_y, float(x.size + y.size - 2)
+    if part_x == part_y == 0:
+        t = 0.0 if difference == 0 else math.copysign(math.inf, difference)
+        return Test(t, df, 1.0 if t == 0 else 0.0, difference, t)
+    from scipy.special import stdtr
 
-    result: Any = stats.ttest_ind(x, y, equal_var=equal_variances)
-    return Test(float(result.statistic), float(result.df), float(result.pvalue), difference, hedges_g(x, y))
+    if equal_variances:
+        part_x = part_y = ((x.size - 1) * part_x + (y.size - 1) * part_y) / df
+    part_x, part_y = part_x / x.size, part_y / y.size
+    if not equal_variances:
+        share = part_x / (part_x + part_y)
+        df = 1 / (share**2 / (x.size - 1) + (1 - share) ** 2 / (y.size - 1))
+    t = difference / math.sqrt(part_x + part_y)
+    return Test(t, df, float(2 * stdtr(df, -abs(t))), difference, hedges_g(x, y))
+
+
+def _mean_and_variance(x: np.ndarray) -> tuple[float, float]:
+    """Exact for a constant sample, whose rounded mean may differ from its values."""
+    return (float(x[0]), 0.0) if np.ptp(x) == 0 else (float(x.mean()), float(x.var(ddof=1)))
 
 
 def hedges_g(a: object, b: object) -> float:
     """Standardised difference with the small-sample correction 1 - 3 / (4 df - 1); infinite without spread."""
     x, y = _sample("a", a), _sample("b", b)
-    df = x.size + y.size - 2
-    pooled = math.sqrt(((x.size - 1) * x.var(ddof=1) + (y.size - 1) * y.var(ddof=1)) / df)
-    difference = float(x.mean() - y.mean())
+    mean_x, variance_x = _mean_and_variance(x)
+    mean_y, variance_y = _mean_and_variance(y)
+    difference, df = mean_x - mean_y, x.size + y.size - 2
+    pooled = math.sqrt(((x.size - 1) * variance_x + (y.size - 1) * variance_y) / df)
     if pooled == 0:
         return 0.0 if difference == 0 else math.copysign(math.inf, difference)
     return difference / pooled * (1 - 3 / (4 * df - 1))
@@ -138,14 +155,21 @@ def probability_of_improvement(a: object, b: object) -> float:
 
 def bonferroni(p_values: Sequence[float]) -> list[float]:
     """Each p times their number, at most 1."""
+    _check_p(p_values)
     return [min(1.0, p * len(p_values)) for p in p_values]
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
     """Holm's step-down adjustment: never weaker than Bonferroni's."""
+    _check_p(p_values)
     order = np.argsort(p_values)
     adjusted, running = [0.0] * len(p_values), 0.0
     for rank, i in enumerate(order):
         running = max(running, min(1.0, p_values[i] * (len(p_values) - rank)))
         adjusted[i] = running
     return adjusted
+
+
+def _check_p(p_values: Sequence[float]) -> None:
+    for i, p in enumerate(p_values):
+        _checks.number(f"p_values[{i}]", p, low=0, high=1)

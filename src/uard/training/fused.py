@@ -162,7 +162,7 @@ def run(one: Lane, program: Program) -> Outcome:
     # One row per state-action, so that a step reads each table once.
     one_each = jnp.ones_like(task.reward)
     columns = [one.truth.hack, one.truth.reward, task.reward, one.truth.goal, one_each, 0.0 * one_each]
-    scored = jnp.stack(columns, axis=-1).astype(jnp.float32).reshape(states * actions, len(LOG))
+    scored = jnp.stack([c.astype(jnp.float32) for c in columns], axis=-1).reshape(states * actions, len(LOG))
     centre = one.ratings.centre.reshape(states * actions, raters)
     deviation = one.ratings.deviation.reshape(states * actions, raters)
     agent_words = tabular.words(agent)
@@ -247,7 +247,7 @@ def run(one: Lane, program: Program) -> Outcome:
             usual=c.usual,
             state=state,
             time=jnp.where(done, 0, c.time + 1),
-            episode=c.episode + done,
+            episode=c.episode + done.astype(jnp.int32),
             epsilon=jnp.where(done, tabular.next_epsilon(agent, c.epsilon), c.epsilon),
             sums=jnp.where(done, 0.0, sums),
             log=log,

@@ -26,9 +26,11 @@ def _register(cls: type) -> None:
     if cls in _known:
         return
     names = [f.name for f in dataclasses.fields(cls)]
+    real = [f.type in (float, "float") for f in dataclasses.fields(cls)]
 
     def flatten(obj: Any) -> tuple[list[Any], tuple[Any, ...]]:
         values = [getattr(obj, n) for n in names]
+        values = [float(v) if is_real and isinstance(v, int) else v for v, is_real in zip(values, real, strict=True)]
         numeric = tuple(_is_numeric(v) for v in values)
         rest = tuple(None if is_n else v for v, is_n in zip(values, numeric, strict=True))
         return [v for v, is_n in zip(values, numeric, strict=True) if is_n], (numeric, rest)

@@ -1,0 +1,22 @@
+"""Draws the pictures that README and docs show, from real training: ``.venv/bin/python docs/make_images.py``."""
+
+from pathlib import Path
+
+from uard import studies
+from uard.lab import runner
+from uard.lab.store import Store
+from uard.reporting import figures
+from uard.reporting.evidence import Evidence
+
+
+def main() -> None:
+    """Train seed 0 of the scale study and draw the walks."""
+    (study,) = studies.find(("scale",))
+    store = Store(":memory:")
+    runner.run(study.jobs([0]), store, workers=1)
+    figure = figures.walks(Evidence(store, [0], [study]))
+    figure.savefig(Path(__file__).parent / "images" / "walks.png", dpi=80, bbox_inches="tight")
+
+
+if __name__ == "__main__":
+    main()

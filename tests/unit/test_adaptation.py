@@ -1,0 +1,86 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from uard._checks import InvalidValueError
+from uard.adaptation import adaptive_lambda, standing, towards_target_discount
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((5.0, 1.0, 0.5), 8.0),
+        ((5.0, 1.0, 0.5, 1.0), 4.0),
+        ((-1.0, 1.0, 0.5), -4.0),
+        ((5.0, 1.0, 0.0), 0.0),
+        ((5.0, 1.0, 0.0, 2.0), 2.0),
+    ],
+)
+def test_standing_by_hand(arguments, expected):
+    assert standing(*arguments) == expected
+    assert standing(*(np.array([a, a]) for a in arguments)).tolist() == [expected] * 2
+
+
+@pytest.mark.parametrize(("z", "expected"), [(3.0, 10.0), (1.5, 4.0), (1.0, 2.0), (0.0, 2.0), (-5.0, 2.0)])
+def test_adaptive_lambda_by_hand(z, expected):
+    assert adaptive_lambda(z, lam=2.0, kappa=2.0) == expected
+    assert adaptive_lambda(z, lam=2.0, kappa=0.0) == 2.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((2.0, 0.9, 0.5), 2.081622),
+        ((2.0, 0.1, 0.5), 1.921579),
+        ((2.0, 0.5, 0.5), 2.0),
+        ((2.0, 1.0, 0.5, 2.0), 5.436564),
+    ],
+)
+def test_towards_target_discount_by_hand(arguments, expected):
+    assert towards_target_discount(*arguments) == pytest.approx(expected, abs=1e-6)
+
+
+def test_towards_target_discount_finds_the_lambda_with_that_mean_weight():
+    u, lam = np.array([0.1, 0.5, 2.0]), 0.01
+    for _ in range(500):
+        lam = towards_target_discount(lam, float(np.mean(1 / (1 + lam * u))), 0.6, rate=1.0)
+    assert np.mean(1 / (1 + lam * u)) == pytest.approx(0.6, abs=1e-6)
+
+
+CASES = {
+    "standing": lambda a: standing(a["v"], a["l"], a["d"]),
+    "standing-floor": lambda a: standing(a["v"], 0.5, 0.1, floor=a["d"]),
+    "standing-flat": lambda a: standing(a["v"], 0.5, 0.0),
+    "standing-scalar": lambda a: standing(2.0, a["l"], a["d"]),
+    "adaptive_lambda": lambda a: adaptive_lambda(a["v"], 0.2, 20.0),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_array_library_gives_the_same(backend, case):
+    values = {"v": np.array([-1.0, 0.5, 3.0]), "l": np.array([0.0, 0.5, 1.0]), "d": np.array([0.0, 0.5, 0.25])}
+    backend.agrees(CASES[case], values)
+
+
+def test_numpys_numbers_go_with_torch():
+    z = standing(torch.tensor([-1.0, 3.0]), np.float64(0.5), np.float64(0.25))
+    assert z.dtype == torch.float32
+    assert adaptive_lambda(z, lam=2.0, kappa=2.0).tolist() == [2.0, 38.0]
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "message"),
+    [
+        (adaptive_lambda, (1.0, -1.0), r"^lam = -1\.0: must be a finite number >= 0$"),
+        (adaptive_lambda, (1.0, 2.0, math.inf), "^kappa = inf: must be a finite number >= 0$"),
+        (towards_target_discount, (0.0, 0.5, 0.5), r"^lam = 0\.0: must be a finite number > 0$"),
+        (towards_target_discount, (1.0, 1.5, 0.5), r"^mean_weight = 1\.5: must be a finite number in \[0, 1\]$"),
+        (towards_target_discount, (1.0, 0.5, 0.0), r"^target = 0\.0: must be a finite number in \(0, 1\]$"),
+        (towards_target_discount, (1.0, 0.5, 0.5, 0.0), r"^rate = 0\.0: must be a finite number > 0$"),
+    ],
+)
+def test_bad_parameters_are_refused(function, arguments, message):
+    with pytest.raises(InvalidValueError, match=message):
+        function(*arguments)

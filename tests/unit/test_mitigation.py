@@ -1,0 +1,261 @@
+import doctest
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+import uard.mitigation
+from uard import Evidence, Feedback, LearningSignal, Mitigation, ReliabilityFilter, RewardDiscounting
+from uard._checks import InvalidValueError, UnknownNameError
+from uard.mitigation import NAMED, RatedReward, Raw, Screening, Usual, measure_usual, named
+from uard.reliability import FORMS
+from uard.uncertainty import Spread
+
+SIGMA_H = math.sqrt(14 / 9)  # of the ratings {-1, 2, 1}
+WITH_PROXY = math.sqrt(3.25)  # of {-1, 2, 1, 4}
+
+
+def evidence(count=3.0, reward=4.0, sigma_m=0.4):
+    a = np.array
+    feedback = Feedback(a([count]), a([2 / 3]), a([-1.0]), a([SIGMA_H]), a([4.0]), 3.0)
+    return Evidence(a([reward]), a([sigma_m]), feedback)
+
+
+USUAL = Usual(Spread(0.5, 0.25), 2.0, -0.5)
+TABLE = Feedback(
+    count=np.array([0.0, 1.0, 3.0, 10.0]),
+    mean=np.array([0.1, -0.2, 2 / 3, 0.5]),
+    lowest=np.array([-1.0, -2.0, -1.0, 0.2]),
+    spread=np.array([0.1, 0.2, SIGMA_H, 0.0]),
+    proxy=np.array([1.0, 0.5, 4.0, -0.1]),
+    raters=np.array(3.0),
+)
+SIGMA_M = np.array([0.0, 0.4, 1.0, 2.0])
+MU = np.array([1.0, -1.0, 0.0, 4.0])
+
+
+def learned(mitigation, table=TABLE):
+    return mitigation.signal(Evidence(table.proxy, SIGMA_M, table), mitigation.usual(table, table.count > 0))
+
+
+def scored(mitigation, mu=MU, sigma_m=SIGMA_M, table=TABLE):
+    return mitigation.score(mu, sigma_m, table, mitigation.usual(table, table.count > 0))
+
+
+@pytest.mark.parametrize(
+    ("mitigation", "count", "expected"),
+    [
+        (Raw(), 3.0, 4.0),
+        (RatedReward(), 3.0, 2 / 3),
+        (RatedReward("lowest"), 3.0, -1.0),
+        (RatedReward("bound", k=1.0), 3.0, 1.5 - WITH_PROXY),
+        (RatedReward("bound", k=0.0), 3.0, 1.5),
+        (RatedReward("bound"), 0.0, 4.0),
+        (RatedReward(unrated_weight=0.25), 0.0, -0.5 + 0.25 * 4.5),
+        (named("uard-operator"), 3.0, 4 / (1 + 2 * 0.5 * (0.4 + SIGMA_H))),
+        (named("uard-operator", alpha=0.0), 3.0, 4 / (1 + SIGMA_H)),
+        (named("uard-operator"), 0.0, 4.0),
+        (named("uard-operator", proxy_is_rater=True), 3.0, 4 / (1 + 0.4 + WITH_PROXY)),
+        (named("uard-operator", standardise=True), 3.0, 4 / (1 + (0.4 + SIGMA_H) / 2)),
+        (named("uard-operator", kappa=1.0), 3.0, 4 / (1 + ((SIGMA_H - 0.5) / 0.25) * (0.4 + SIGMA_H))),
+        (named("uard-operator", anchor="lowest"), 3.0, -1 + 5 / (1 + 0.4 + SIGMA_H)),
+        (named("uard-operator", anchor="lowest", prior_count=1.0), 0.0, 4.0),
+        (named("uard-operator", anchor="lowest", prior_count=1.0, unrated_weight=0.0), 0.0, -0.5),
+        (named("uard-paper"), 3.0, 4.0),
+    ],
+)
+def test_reward_by_hand(mitigation, count, expected):
+    signal = mitigation.signal(evidence(count), USUAL)
+    assert float(signal.reward[0]) == pytest.approx(expected, abs=1e-12)
+    assert signal.sample_weight == 1.0
+
+
+def test_recommended_form_by_hand():
+    z = (WITH_PROXY - 0.5) / 0.25
+    lam = 0.2 * (1 + 20.0 * (z - 1))
+    w = (3 / (1 + lam * 0.5 * (0.4 + WITH_PROXY) / 2) + 0.1) / 4
+    anchor = (3 * -1.0 - 0.5) / 4
+    signal = named("uard", kappa=20.0, unrated_weight=0.1, prior_count=1.0).signal(evidence(), USUAL)
+    assert float(signal.reward[0]) == pytest.approx(anchor + w * (4 - anchor), abs=1e-12)
+    assert float(signal.reward[0]) == pytest.approx(-0.4011, abs=1e-4)
+
+
+def test_recommended_form_believes_a_bonus_that_all_raters_confirm():
+    feedback = Feedback(*(np.array([x]) for x in (100.0, 4.0, 4.0, 0.0, 4.0)), 3.0)
+    signal = named("uard").signal(Evidence(np.array([4.0]), np.array([0.0]), feedback), USUAL)
+    assert float(signal.reward[0]) == pytest.approx(4.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("limit", "count", "weight"), [(0.5, 3.0, 0.0), (0.91, 3.0, 1.0), (0.5, 0.0, 1.0)])
+def test_screening_leaves_out_contested_steps(limit, count, weight):
+    signal = Screening(limit).signal(evidence(count), USUAL)
+    assert signal.sample_weight.tolist() == [weight]
+    assert signal.reward.tolist() == [4.0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, MU / (1 + 2 * 0.5 * (SIGMA_M + TABLE.spread))),
+        ({"anchor": "lowest"}, -1 + (MU + 1) / (1 + 2 * 0.5 * (SIGMA_M + TABLE.spread))),
+        ({"lam": 0.0}, MU),
+        ({"acts_on": "reward"}, MU),
+    ],
+)
+def test_score_by_hand(changes, expected):
+    rated = TABLE._replace(count=np.ones(4))
+    np.testing.assert_allclose(scored(named("uard-paper", **changes), table=rated), expected)
+    unrated = TABLE._replace(count=np.zeros(4))
+    np.testing.assert_allclose(scored(named("uard-paper", **changes), table=unrated), MU)
+
+
+def test_usual_is_over_what_was_rated():
+    seen = TABLE.count > 0
+    usual = measure_usual(TABLE, seen, proxy_is_rater=False)
+    assert usual.disagreement.location == pytest.approx((0.2 + SIGMA_H) / 3)
+    assert usual.scale == pytest.approx(np.std([0.5, 4.0, -0.1]))
+    assert usual.lowest == pytest.approx(-2.8 / 3)
+    with_proxy = measure_usual(TABLE, TABLE.count == 3, proxy_is_rater=True)
+    assert with_proxy.disagreement == pytest.approx((WITH_PROXY, 0.0))
+    before = measure_usual(TABLE, np.zeros(4, bool), proxy_is_rater=True)
+    assert (before.disagreement, before.scale, before.lowest) == ((0.0, 0.0), 1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("mitigation", "proxy_is_rater"),
+    [(named("uard"), True), (named("uard-paper"), False), (Screening(), True), (RatedReward(), False)],
+)
+def test_usual_counts_the_proxy_as_the_mitigation_does(mitigation, proxy_is_rater):
+    seen = TABLE.count > 0
+    assert mitigation.usual(TABLE, seen) == measure_usual(TABLE, seen, proxy_is_rater)
+    assert mitigation.usual(TABLE, seen) != measure_usual(TABLE, seen, not proxy_is_rater)
+
+
+def scale_of(table, seen):
+    return measure_usual(table, seen, proxy_is_rater=False).scale
+
+
+@pytest.mark.parametrize("size", [7, 400])
+def test_scale_of_equal_rewards_is_one_whatever_their_rounding(backend, size):
+    seen = np.arange(size) % 7 < 6
+    for reward in (-0.1, 1e6 / 3, 1e-6 / 3):
+        table = Feedback(*(np.full(size, reward),) * 5, np.array(3.0))
+        assert float(backend.call(scale_of, table, seen)) == 1.0
+        varied = table._replace(proxy=np.where(np.arange(size) % 2, 1.1, 1.0) * reward)
+        assert float(backend.call(scale_of, varied, seen)) == pytest.approx(np.std(varied.proxy[seen]), rel=1e-2)
+
+
+MORE = {f"both-{form}": (lambda f=form: RewardDiscounting(ReliabilityFilter(form=f), acts_on="both")) for form in FORMS}
+
+
+@pytest.mark.parametrize("name", [*NAMED, *MORE])
+def test_every_array_library_gives_the_same(backend, name):
+    mitigation = (NAMED | MORE)[name]()
+
+    def everything(table, mu, sigma_m):
+        usual = mitigation.usual(table, table.count > 0)
+        signal = mitigation.signal(Evidence(table.proxy, sigma_m, table), usual)
+        return usual, signal, mitigation.score(mu, sigma_m, table, usual)
+
+    backend.agrees(everything, TABLE, MU, SIGMA_M)
+
+
+@pytest.mark.parametrize("name", [*NAMED, *MORE])
+def test_what_was_never_rated_means_nothing(name):
+    mitigation = (NAMED | MORE)[name]()
+    poisoned = Feedback(*(np.where(TABLE.count > 0, x, x if x is TABLE.count else np.nan) for x in TABLE[:5]), 3.0)
+    clean, dirty = (learned(mitigation, t._replace(proxy=TABLE.proxy)) for t in (TABLE, poisoned))
+    np.testing.assert_array_equal(clean.reward, dirty.reward)
+    np.testing.assert_array_equal(clean.sample_weight, dirty.sample_weight)
+    np.testing.assert_array_equal(scored(mitigation), scored(mitigation, table=poisoned))
+
+
+@pytest.mark.parametrize(
+    ("name", "reads_sigma_m", "reads_sigma_h"),
+    [
+        ("raw", False, False),
+        ("uard-paper", True, True),
+        ("uard-lite", True, False),
+        ("human-only", False, True),
+        ("no-discount", False, False),
+    ],
+)
+def test_ablations_read_what_they_say(name, reads_sigma_m, reads_sigma_h):
+    mitigation, more = named(name), TABLE._replace(spread=TABLE.spread + 1)
+    assert (scored(mitigation, sigma_m=SIGMA_M + 1) != scored(mitigation)).any() == reads_sigma_m
+    assert (scored(mitigation, table=more) != scored(mitigation)).any() == reads_sigma_h
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_named_mitigations_keep_the_contract(name):
+    mitigation = named(name)
+    assert isinstance(mitigation, Mitigation)
+    assert mitigation.reads_feedback is (name != "raw")
+    assert mitigation.backup == ("consistent" if name == "uard-consistent" else "greedy")
+    assert mitigation == named(name)
+    assert hash(mitigation) == hash(named(name))
+
+
+def test_named_takes_changes():
+    assert named("uard", lam=1.0, kappa=3.0) == RewardDiscounting(ReliabilityFilter(lam=1.0), kappa=3.0)
+    assert named("worst-of-annotations", unrated_weight=0.5) == RatedReward("lowest", unrated_weight=0.5)
+    assert named("uard-wiener").filter == ReliabilityFilter(form="wiener")
+
+
+def test_a_users_own_mitigation_is_one_small_class():
+    @dataclass(frozen=True)
+    class Clip(Mitigation):
+        limit: float = 1.0
+
+        def signal(self, evidence, usual):
+            return LearningSignal(np.minimum(evidence.reward, self.limit), 1.0)
+
+    clip = Clip(limit=2.0)
+    assert isinstance(clip, Mitigation)
+    assert (clip.reads_feedback, clip.backup) == (True, "greedy")
+    assert learned(clip).reward.tolist() == [1.0, 0.5, 2.0, -0.1]
+    assert scored(clip) is MU
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: RatedReward("median"), "^statistic = 'median': must be one of bound, lowest, mean"),
+        (lambda: RatedReward(k=-1.0), r"^k = -1\.0: must be a finite number >= 0$"),
+        (lambda: RatedReward(unrated_weight=2), r"^unrated_weight = 2: must be a finite number in \[0, 1\]$"),
+        (lambda: Screening(0.0), r"^limit = 0\.0: must be a finite number > 0$"),
+        (lambda: RewardDiscounting(acts_on="rewards"), r"^acts_on = 'rewards': .*\(did you mean 'reward'\?\)$"),
+        (lambda: RewardDiscounting(anchor="lowst"), r"^anchor = 'lowst': .*\(did you mean 'lowest'\?\)$"),
+        (lambda: RewardDiscounting(backup="gredy"), r"^backup = 'gredy': .*\(did you mean 'greedy'\?\)$"),
+        (lambda: RewardDiscounting(kappa=math.nan), "^kappa = nan: must be a finite number >= 0$"),
+        (lambda: RewardDiscounting(unrated_weight=-0.1), r"^unrated_weight = -0\.1: .* in \[0, 1\]$"),
+        (lambda: RewardDiscounting(prior_count=-1), "^prior_count = -1: must be a finite number >= 0$"),
+        (lambda: named("uard", lam=-1), "^lam = -1: must be a finite number >= 0$"),
+        (lambda: named("uard-paper", alpha=1.1), r"^alpha = 1\.1: must be a finite number in \[0, 1\]$"),
+        (lambda: named("uard", sigma_m=0.0), "sigma_m"),
+    ],
+)
+def test_bad_parameters_are_refused(make, message):
+    with pytest.raises((InvalidValueError, TypeError), match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"), [("uard_paper", "uard-paper"), ("UARD", "uard"), ("lbc", "lcb"), ("mean-of-anotations", None)]
+)
+def test_an_unknown_name_suggests_the_nearest(name, nearest):
+    nearest = nearest or "mean-of-annotations"
+    with pytest.raises(UnknownNameError, match=rf"^mitigation = '{name}': .*\(did you mean '{nearest}'\?\)$"):
+        named(name)
+
+
+def test_negative_uncertainty_is_refused():
+    with pytest.raises(InvalidValueError, match=r"^sigma_m\[0\] = -0\.2: must be finite and >= 0$"):
+        named("uard").signal(evidence(sigma_m=-0.4), USUAL)
+
+
+def test_docstring_examples_run():
+    result = doctest.testmod(uard.mitigation)
+    assert result.attempted > 0
+    assert result.failed == 0
