@@ -112,21 +112,21 @@ def student(a: object, b: object) -> Test:
 
 def _t_test(a: object, b: object, equal_variances: bool) -> Test:
     x, y = _sample("a", a), _sample("b", b)
-    mean_x, part_x = _mean_and_variance(x)
-    mean_y, part_y = _mean_and_variance(y)
+    mean_x, variance_x = _mean_and_variance(x)
+    mean_y, variance_y = _mean_and_variance(y)
     difference, df = mean_x - mean_y, float(x.size + y.size - 2)
-    if part_x == part_y == 0:
+    if variance_x == variance_y == 0:
         t = 0.0 if difference == 0 else math.copysign(math.inf, difference)
         return Test(t, df, 1.0 if t == 0 else 0.0, difference, t)
     from scipy.special import stdtr
 
     if equal_variances:
-        part_x = part_y = ((x.size - 1) * part_x + (y.size - 1) * part_y) / df
-    part_x, part_y = part_x / x.size, part_y / y.size
+        variance_x = variance_y = ((x.size - 1) * variance_x + (y.size - 1) * variance_y) / df
+    variance = variance_x / x.size + variance_y / y.size
     if not equal_variances:
-        share = part_x / (part_x + part_y)
+        share = variance_x / x.size / variance
         df = 1 / (share**2 / (x.size - 1) + (1 - share) ** 2 / (y.size - 1))
-    t = difference / math.sqrt(part_x + part_y)
+    t = difference / math.sqrt(variance)
     return Test(t, df, float(2 * stdtr(df, -abs(t))), difference, hedges_g(x, y))
 
 

@@ -8,6 +8,8 @@ import json
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from uard import _checks
 from uard.agents.tabular import QLearning
 from uard.envs.panels import PANELS
@@ -52,13 +54,17 @@ class Cell:
         _checks.whole("episodes", self.episodes, low=1, high=1_000_000)
         _checks.whole("ddof", self.ddof, low=0, high=1)
         _checks.whole("snapshots", self.snapshots, low=0, high=1000)
-        if not isinstance(self.mitigation, Mitigation):
-            raise _checks.InvalidValueError("mitigation", self.mitigation, "a Mitigation (see uard.Mitigation)")
+        for name, kind in (("environment", TrapGrid), ("mitigation", Mitigation), ("agent", QLearning)):
+            value = getattr(self, name)
+            if not isinstance(value, kind) or not _is_frozen(value):
+                allowed = f"a frozen dataclass that is a {kind.__name__}"
+                raise _checks.InvalidValueError(name, value, allowed)
+            object.__setattr__(self, name, _settled(name, value))
         if not self.mitigation.reads_feedback:
             for name, value in (("panel", "main"), ("noise", 0.0), ("rated", 1.0)):
                 object.__setattr__(self, name, value)
-        object.__setattr__(self, "noise", float(self.noise))
-        object.__setattr__(self, "rated", float(self.rated))
+        for name, kind in (("noise", float), ("rated", float), ("episodes", int), ("ddof", int), ("snapshots", int)):
+            object.__setattr__(self, name, kind(getattr(self, name)))
 
     def config(self) -> dict[str, Any]:
         """Return the whole configuration as plain data."""
@@ -73,6 +79,40 @@ class Cell:
     def with_(self, **changes: Any) -> Cell:
         """Return a copy with some fields changed."""
         return replace(self, **changes)
+
+
+def _is_frozen(value: Any) -> bool:
+    parameters = getattr(type(value), "__dataclass_params__", None)
+    return parameters is not None and parameters.frozen
+
+
+def _settled(name: str, value: Any) -> Any:
+    """Bring equal settings (2 and 2.0, 0.0 and -0.0, NumPy's numbers) to one form, so that their keys are equal.
+
+    Raises:
+        InvalidValueError: a setting that cannot be part of a key.
+    """
+    if _is_frozen(value):
+        changes = {}
+        for f in dataclasses.fields(value):
+            old = getattr(value, f.name)
+            new = _settled(f"{name}.{f.name}", old)
+            if f.type in (float, "float") and type(new) is int:
+                new = float(new)
+            if type(new) is not type(old) or repr(new) != repr(old):
+                changes[f.name] = new
+        return replace(value, **changes) if changes else value
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, tuple):
+        return tuple(_settled(f"{name}[{i}]", v) for i, v in enumerate(value))
+    if isinstance(value, float):
+        _checks.number(name, value)
+        return value + 0.0
+    if not (value is None or isinstance(value, bool | int | str)):
+        allowed = "a number, text, true, false, none, or a tuple or frozen dataclass of these"
+        raise _checks.InvalidValueError(name, value, allowed)
+    return value
 
 
 def plain(value: Any) -> Any:

@@ -7,6 +7,7 @@ import json
 from typing import Any
 
 from uard import _checks, mitigation
+from uard.abstention import Abstention
 from uard.agents.tabular import QLearning
 from uard.envs.panels import PANELS
 from uard.envs.trapgrid import TrapGrid
@@ -52,9 +53,16 @@ def changed(base: Any, changes: dict[str, Any], what: str) -> Any:
         head, _, rest = name.partition(".")
         if head not in fields:
             raise _checks.UnknownNameError(f"{what} setting", name, fields)
+        old = given.get(head, getattr(base, head))
+        has_parts = dataclasses.is_dataclass(old)
+        if bool(rest) != has_parts:
+            part = f"{head}.{dataclasses.fields(old)[0].name}" if has_parts else head
+            raise _checks.InvalidValueError(f"{what} setting", name, f"{part!r}: {head} has {'' if has_parts else 'no '}parts")
         if rest:
-            value = changed(given.get(head, getattr(base, head)), {rest: value}, f"{what}.{head}")
-        elif isinstance(getattr(base, head), float) and isinstance(value, int) and not isinstance(value, bool):
+            value = changed(old, {rest: value}, f"{what}.{head}")
+        elif isinstance(old, bool) and not isinstance(value, bool):
+            raise _checks.InvalidValueError(f"{what} setting {name}", value, "true or false")
+        elif isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         elif isinstance(value, list):
             value = tuple(tuple(v) if isinstance(v, list) else v for v in value)
@@ -81,8 +89,11 @@ def _bare(grid: TrapGrid) -> TrapGrid:
 
 
 def agent(name: str, changes: dict[str, Any]) -> QLearning:
-    """Return an agent by name, some fields changed."""
-    return changed(AGENTS[_checks.choose("agent", name, AGENTS)], changes, "agent")
+    """Return an agent by name, some fields changed (``abstention.rule`` and the like make it abstain)."""
+    base = AGENTS[_checks.choose("agent", name, AGENTS)]
+    if any(field.startswith("abstention.") for field in changes):
+        base = dataclasses.replace(base, abstention=Abstention())
+    return changed(base, changes, "agent")
 
 
 def mitigation_named(name: str, changes: dict[str, Any]) -> Mitigation:

@@ -266,9 +266,11 @@ def run(one: Lane, program: Program) -> Outcome:
             c = c._replace(usual=usual(c.feedback))
         c, _ = lax.scan(one_step, c, (own, noise, rated))
         if program.snapshots:
+            # A chunk can pass over several episodes, so all later slots are filled; the next chunk overwrites them.
             slot = jnp.minimum(c.episode * program.snapshots // program.episodes, program.snapshots - 1)
-            q_kept = lax.dynamic_update_index_in_dim(q_kept, c.q, slot, 0)
-            f_kept = lax.dynamic_update_index_in_dim(f_kept, c.feedback, slot, 0)
+            later = (jnp.arange(program.snapshots) >= slot)[:, None, None, None]
+            q_kept = jnp.where(later, c.q, q_kept)
+            f_kept = jnp.where(later, c.feedback, f_kept)
         return c, number + 1, q_kept, f_kept
 
     key = jax.random.wrap_key_data(jnp.stack([one.seed, jnp.uint32(0)]), impl="threefry2x32")
