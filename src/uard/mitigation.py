@@ -262,7 +262,9 @@ class RewardDiscounting(Mitigation):
         z = adaptation.standing(sigma_h, *usual.disagreement, floor=_DEVIATION_FLOOR * usual.scale)
         lam = adaptation.adaptive_lambda(z, self.filter.lam, self.kappa)
         unit = usual.scale if self.standardise else 1.0
-        weight = self.filter.weight(sigma_m / unit, sigma_h / unit, mu=abs(mu) / unit, lam=lam)
+        weight = self.filter.weight(
+            sigma_m / unit, sigma_h / unit, mu=(mu if self.anchor == "zero" else abs(mu)) / unit, lam=lam
+        )
         return uncertainty.shrink(weight, feedback.count, self.unrated_weight, self.prior_count)
 
     def signal(self, evidence: Evidence, usual: Usual) -> LearningSignal:

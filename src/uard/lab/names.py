@@ -54,10 +54,9 @@ def changed(base: Any, changes: dict[str, Any], what: str) -> Any:
         if head not in fields:
             raise _checks.UnknownNameError(f"{what} setting", name, fields)
         old = given.get(head, getattr(base, head))
-        has_parts = dataclasses.is_dataclass(old)
-        if bool(rest) != has_parts:
-            part = f"{head}.{dataclasses.fields(old)[0].name}" if has_parts else head
-            raise _checks.InvalidValueError(f"{what} setting", name, f"{part!r}: {head} has {'' if has_parts else 'no '}parts")
+        parts = [f"{head}.{f.name}" for f in dataclasses.fields(old)] if dataclasses.is_dataclass(old) else []
+        if bool(rest) != bool(parts):
+            raise _checks.InvalidValueError(f"{what} setting", name, f"one of {', '.join(parts)}" if parts else head)
         if rest:
             value = changed(old, {rest: value}, f"{what}.{head}")
         elif isinstance(old, bool) and not isinstance(value, bool):
@@ -91,7 +90,7 @@ def _bare(grid: TrapGrid) -> TrapGrid:
 def agent(name: str, changes: dict[str, Any]) -> QLearning:
     """Return an agent by name, some fields changed (``abstention.rule`` and the like make it abstain)."""
     base = AGENTS[_checks.choose("agent", name, AGENTS)]
-    if any(field.startswith("abstention.") for field in changes):
+    if any(field.partition(".")[0] == "abstention" for field in changes):
         base = dataclasses.replace(base, abstention=Abstention())
     return changed(base, changes, "agent")
 
@@ -99,9 +98,11 @@ def agent(name: str, changes: dict[str, Any]) -> QLearning:
 def mitigation_named(name: str, changes: dict[str, Any]) -> Mitigation:
     """Return a mitigation by name, some fields changed (``filter.lam`` and the like for the filter's)."""
     base = mitigation.named(name)
-    short = {"lam", "alpha", "beta", "form"}
-    full = {f"filter.{k}" if k in short and hasattr(base, "filter") else k: v for k, v in changes.items()}
-    return changed(base, full, "mitigation")
+    short = {f.name for f in dataclasses.fields(base.filter)} if hasattr(base, "filter") else set()
+    known = short | {f.name for f in dataclasses.fields(base)}
+    for setting in changes:
+        _checks.choose("mitigation setting", setting.partition(".")[0], known)
+    return changed(base, {f"filter.{k}" if k in short else k: v for k, v in changes.items()}, "mitigation")
 
 
 def panel(name: str) -> str:

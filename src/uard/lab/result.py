@@ -33,6 +33,11 @@ class CorruptResultError(RuntimeError):
     """A stored result whose bytes are not what was written."""
 
 
+def digest(data: bytes) -> str:
+    """Return the checksum of a packed result."""
+    return hashlib.sha256(data).hexdigest()
+
+
 @dataclass(frozen=True)
 class Result:
     """One trained seed.
@@ -74,7 +79,7 @@ class Result:
         }
         np.savez_compressed(buffer, **arrays)
         data = buffer.getvalue()
-        return data, hashlib.sha256(data).hexdigest()
+        return data, digest(data)
 
     @staticmethod
     def unpack(data: bytes, checksum: str) -> Result:
@@ -83,7 +88,7 @@ class Result:
         Raises:
             CorruptResultError: the bytes do not have that checksum, or hold NaN.
         """
-        if hashlib.sha256(data).hexdigest() != checksum:
+        if digest(data) != checksum:
             raise CorruptResultError("checksum does not match")
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             named = {name: arrays[name] for name in arrays.files}

@@ -10,15 +10,17 @@ from pathlib import Path
 
 from uard import __version__
 from uard.lab.cell import Cell
-from uard.lab.result import CorruptResultError, Result
+from uard.lab.result import CorruptResultError, Result, digest
 
 _SCHEMA = """
+begin immediate;
 create table if not exists cells (key text primary key, config text not null);
 create table if not exists results (
     key text not null references cells (key), seed integer not null, data blob not null, checksum text not null,
     version text not null, created real not null, primary key (key, seed)
 );
 create table if not exists quarantine (key text, seed integer, data blob, reason text, created real);
+commit;
 """
 
 
@@ -44,12 +46,11 @@ class Store:
             if self.path != ":memory:":
                 Path(self.path).parent.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(self.path, timeout=60)
-            if self._db.execute("pragma quick_check(1)").fetchone()[0] != "ok":
-                raise sqlite3.DatabaseError("its pages are damaged")
-            self._db.execute("pragma journal_mode=wal")
-            self._db.execute("pragma synchronous=normal")
-            with self._db:
-                self._db.executescript(_SCHEMA)
+            try:
+                self._prepare()
+            except BaseException:
+                self._db.close()
+                raise
         except OSError as error:
             raise StoreError(f"store = {self.path!r}: must be in a folder that can be written ({error})") from None
         except sqlite3.OperationalError as error:
@@ -60,13 +61,27 @@ class Store:
                 "and start again, or name another with --store"
             ) from None
 
+    def _prepare(self) -> None:
+        if self._db.execute("pragma quick_check(1)").fetchone()[0] != "ok":
+            raise sqlite3.DatabaseError("its pages are damaged")
+        tables = {row[0] for row in self._db.execute("select name from sqlite_master where type = 'table'")}
+        if tables and not {"cells", "results"} <= tables:
+            raise sqlite3.DatabaseError("it holds other tables")
+        self._db.execute("pragma journal_mode=wal")
+        self._db.execute("pragma synchronous=normal")
+        self._db.executescript(_SCHEMA)
+
     def close(self) -> None:
         """Close the file."""
         self._db.close()
 
     def have(self, cell: Cell) -> set[int]:
-        """Return the seeds that are finished."""
-        return {row[0] for row in self._db.execute("select seed from results where key = ?", (cell.key,))}
+        """Return the seeds that are finished; a corrupt one is quarantined as by ``get``."""
+        rows = self._db.execute("select seed, data, checksum from results where key = ?", (cell.key,)).fetchall()
+        damaged = {seed: data for seed, data, checksum in rows if digest(data) != checksum}
+        for seed, data in damaged.items():
+            self._quarantine(cell.key, seed, data, "checksum does not match")
+        return {row[0] for row in rows} - damaged.keys()
 
     def missing(self, cell: Cell, seeds: Iterable[int]) -> list[int]:
         """Return those of the seeds that are not finished."""
@@ -116,7 +131,7 @@ class Store:
     def _quarantine(self, key: str, seed: int, data: bytes, reason: str) -> None:
         with self._db:
             self._db.execute("insert into quarantine values (?, ?, ?, ?, ?)", (key, seed, data, reason, time.time()))
-            self._db.execute("delete from results where key = ? and seed = ?", (key, seed))
+            self._db.execute("delete from results where key = ? and seed = ? and data = ?", (key, seed, data))
 
     def quarantined(self) -> list[tuple[str, int, str]]:
         """Return (key, seed, reason) of every result that was found corrupt."""

@@ -264,10 +264,10 @@ def run(one: Lane, program: Program) -> Outcome:
             noise = _normal(bits[:, agent_words:-1])
             rated = (tabular.uniform(bits[:, -1]) < one.rated).astype(jnp.float32)
             c = c._replace(usual=usual(c.feedback))
+        slot = c.episode * program.snapshots // program.episodes
         c, _ = lax.scan(one_step, c, (own, noise, rated))
         if program.snapshots:
-            # A chunk can pass over several episodes, so all later slots are filled; the next chunk overwrites them.
-            slot = jnp.minimum(c.episode * program.snapshots // program.episodes, program.snapshots - 1)
+            # A chunk can pass over several slots, so all that are left are filled; the next chunk overwrites them.
             later = (jnp.arange(program.snapshots) >= slot)[:, None, None, None]
             q_kept = jnp.where(later, c.q, q_kept)
             f_kept = jnp.where(later, c.feedback, f_kept)
