@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from uard import studies
 from uard.lab import runner
 from uard.lab.store import Store
