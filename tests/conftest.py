@@ -1,6 +1,11 @@
 from __future__ import annotations
 
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import uard.training  # noqa: F401  isort: skip  (sets XLA's flags, which must come before the first use of JAX)
@@ -16,6 +21,22 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=100)
 settings.register_profile("explore", deadline=None, max_examples=2000)
 settings.load_profile("repeatable")
+
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], AbstractContextManager[Path]]:
+    """Lock a folder that all processes of this test run share: what the first makes in it, the others find."""
+    root = tmp_path_factory.getbasetemp()
+    root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
+
+    @contextmanager
+    def locked(name: str) -> Iterator[Path]:
+        (root / name).mkdir(exist_ok=True)
+        with (root / f"{name}.lock").open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield root / name
+
+    return locked
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -155,6 +156,7 @@ def _run(command: Run, console: Console) -> None:
     from uard.lab.study import results_of
 
     _checks.whole("seeds", command.seeds, low=1, high=100_000)
+    _check_json(command.json)
     environment = names.environment(command.environment, names.settings(command.set))
     noise = command.noise
     if command.noise_fraction is not None:
@@ -227,28 +229,58 @@ def _train(jobs: Any, store: Any, console: Console, what: str, workers: int | No
         return runner.run(jobs, store, workers, lambda done, total: bar.update(task, completed=done, total=total))
 
 
+def _check_json(target: str | None) -> None:
+    """Refuse before training, not after it, what cannot be written."""
+    if target is not None and target != "-":
+        _check_writable("json", target, Path(target).parent)
+        if Path(target).is_dir():
+            raise _invalid("json", target, "a file, not a folder")
+
+
+def _check_writable(field: str, target: str, folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _invalid(field, target, f"in a folder that can be written ({error})") from None
+    if not os.access(folder, os.W_OK):
+        raise _invalid(field, target, "in a folder that can be written")
+
+
+def _invalid(field: str, value: object, allowed: str) -> Exception:
+    from uard import InvalidValueError
+
+    return InvalidValueError(field, value, allowed)
+
+
 def _write_json(data: Any, target: str) -> None:
     text = json.dumps(data, indent=2, allow_nan=False)
     if target == "-":
         print(text)
         return
-    from uard import InvalidValueError
-
     try:
-        Path(target).parent.mkdir(parents=True, exist_ok=True)
-        Path(target).write_text(text + "\n")
+        Path(target).write_text(text + "\n", encoding="utf-8")
     except OSError as error:
-        raise InvalidValueError("json", target, f"a file that can be written ({error})") from None
+        raise _invalid("json", target, f"a file that can be written ({error})") from None
+
+
+def _check_workers(workers: int | None) -> None:
+    from uard import _checks
+
+    if workers is not None:
+        _checks.whole("workers", workers, low=0, high=1024)
 
 
 def _reproduce(command: Reproduce, console: Console) -> None:
-    from uard import InvalidValueError, _checks, studies
+    from uard import _checks, studies
     from uard.lab.store import Store
 
     _checks.whole("seeds", command.seeds, low=2, high=100_000)
+    _check_workers(command.workers)
     chosen = studies.find(command.studies)
     if command.report and len(chosen) < len(studies.grid()):
-        raise InvalidValueError("report", command.report, "left out unless all grid studies are run")
+        raise _invalid("report", command.report, "left out unless all grid studies are run")
+    if command.report:
+        _check_writable("report", command.report, Path(command.report))
     store = Store(command.store)
     seeds = range(command.seeds)
     jobs = [job for study in chosen for job in study.jobs(seeds)]
@@ -278,6 +310,8 @@ def _ledger(command: Ledger, console: Console) -> None:
     from uard.reporting.evidence import Evidence
 
     _checks.whole("seeds", command.seeds, low=2, high=100_000)
+    _check_workers(command.workers)
+    _check_json(command.json)
     for claim in command.claims:
         _checks.choose("claim", claim, ledger.CLAIMS)
     store = Store(command.store)

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+import scipy.stats
 
 from uard.abstention import Abstention
 from uard.agents import tabular
@@ -246,6 +247,17 @@ def test_a_single_head():
     assert out["log"][-50:, VISITS].mean() < 0.5
 
 
+def test_random_bits_become_finite_normals():
+    """All values of the bits that count, in order, against the exact inverse; the highest must not round to infinity."""
+    bits = np.arange(2**16, dtype=np.uint32) << 16 | 1 << 15
+    ends = np.uint32([0, 2**32 - 1])
+    exact = scipy.stats.norm.ppf((bits + 0.5) / 2**32)
+    np.testing.assert_allclose(fused._normal(bits), exact, atol=1e-5)
+    low, high = np.asarray(fused._normal(ends))
+    assert -6 < low < -5
+    assert 5 < high < 6
+
+
 def test_a_share_of_the_steps_is_rated():
     for share in (0.0, 0.1, 1.0):
         out = train(on_grid(rated=share))[0]
@@ -285,3 +297,8 @@ def test_who_plays_safe_acts_otherwise():
     assert (out["log"][:, ABSTAINED] > 0).all()
     assert (out["log"][:, LENGTH] != trained_alone("uard")["log"][:, LENGTH]).any()
     assert np.isfinite(out["q"]).all()
+
+
+def test_no_draw_of_a_rater_is_infinite():
+    extremes = np.array([0, 2**32 - 1, 2**31, 2**32 - 256], np.uint32)
+    assert np.isfinite(np.asarray(fused._normal(extremes))).all()

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -70,7 +71,7 @@ class Cell:
         """Return the whole configuration as plain data."""
         return plain(self)
 
-    @property
+    @cached_property
     def key(self) -> str:
         """A name made of the whole configuration: equal cells have equal keys, and only they."""
         text = json.dumps({"results": RESULTS, "cell": self.config()}, sort_keys=True, allow_nan=False)

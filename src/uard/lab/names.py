@@ -97,7 +97,7 @@ def agent(name: str, changes: dict[str, Any]) -> QLearning:
 
 def mitigation_named(name: str, changes: dict[str, Any]) -> Mitigation:
     """Return a mitigation by name, some fields changed (``filter.lam`` and the like for the filter's)."""
-    base = mitigation.named(name)
+    base: Any = mitigation.named(name)
     short = {f.name for f in dataclasses.fields(base.filter)} if hasattr(base, "filter") else set()
     known = short | {f.name for f in dataclasses.fields(base)}
     for setting in changes:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import io
+import json
+import math
+import zlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,15 +72,10 @@ class Result:
 
     def pack(self) -> tuple[bytes, str]:
         """Return the bytes to store and their checksum."""
-        buffer = io.BytesIO()
-        arrays: dict[str, Any] = {
-            "log": self.log,
-            "steps": self.steps,
-            "path": self.path.astype(np.int32),
-            **self.extra,
-        }
-        np.savez_compressed(buffer, **arrays)
-        data = buffer.getvalue()
+        arrays = {"log": self.log, "steps": np.int64(self.steps), "path": self.path, **self.extra}
+        parts = {name: np.ascontiguousarray(a) for name, a in arrays.items()}
+        header = json.dumps([(name, a.dtype.str, np.shape(arrays[name])) for name, a in parts.items()]).encode()
+        data = zlib.compress(header + b"\n" + b"".join(a.tobytes() for a in parts.values()), 1)
         return data, digest(data)
 
     @staticmethod
@@ -90,8 +87,12 @@ class Result:
         """
         if digest(data) != checksum:
             raise CorruptResultError("checksum does not match")
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            named = {name: arrays[name] for name in arrays.files}
+        header, _, body = zlib.decompress(data).partition(b"\n")
+        named, offset = {}, 0
+        for name, dtype, shape in json.loads(header):
+            count = math.prod(shape)
+            named[name] = np.frombuffer(body, dtype, count, offset).reshape(shape)
+            offset += named[name].nbytes
         log, steps, path = named.pop("log"), int(named.pop("steps")), named.pop("path")
         if not np.isfinite(log).all():
             raise CorruptResultError("the log holds NaN or infinity")

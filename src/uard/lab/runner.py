@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import multiprocessing as mp
 import os
+import pickle
 import signal
 import traceback
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -23,7 +27,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Failure:
-    """A batch that raised: its jobs and the traceback."""
+    """Jobs that raised together, and the traceback."""
 
     jobs: tuple[Job, ...]
     error: str
@@ -66,7 +70,16 @@ def batches(jobs: Iterable[Job], size: int = BATCH) -> list[list[Job]]:
 
 
 def train_batch(batch: Sequence[Job]) -> list[Result]:
-    """Train a batch in this process."""
+    """Train a batch in this process.
+
+    Raises:
+        FloatingPointError: a run diverged.
+    """
+    return [finished() for finished in _train_lanes(batch)]
+
+
+def _train_lanes(batch: Sequence[Job]) -> list[Callable[[], Result]]:
+    """Train a batch; what is returned finishes one job each, and raises if that one diverged."""
     from uard.envs import panels
     from uard.lab.result import finish
     from uard.training import fused
@@ -85,11 +98,11 @@ def train_batch(batch: Sequence[Job]) -> list[Result]:
     if first.snapshots:
         fields = (*fields, "q_snapshots", "feedback_snapshots")
     out = fused.train(lanes, program, fields)
-    results = []
+    finishers = []
     for (cell, _), outcome in zip(batch, out, strict=True):
         task, truth, ratings = tables[cell]
-        results.append(finish(cell, task, truth, ratings.centre.shape[-1], outcome))
-    return results
+        finishers.append(partial(finish, cell, task, truth, ratings.centre.shape[-1], outcome))
+    return finishers
 
 
 def run(jobs: Sequence[Job], store: Store, workers: int | None = None, progress: Progress | None = None) -> int:
@@ -102,7 +115,7 @@ def run(jobs: Sequence[Job], store: Store, workers: int | None = None, progress:
         progress: Called with (finished, to do) after every batch.
 
     Raises:
-        StudyFailedError: some batches raised; all others are stored.
+        StudyFailedError: some jobs raised; all others are stored.
     """
     wanted: dict[Cell, list[int]] = {}
     for cell, seed in jobs:
@@ -118,10 +131,11 @@ def run(jobs: Sequence[Job], store: Store, workers: int | None = None, progress:
         progress(0, len(todo))
     outcomes = _here(queue) if workers <= 1 or len(queue) == 1 else _spread(queue, workers)
     for batch, answer in outcomes:
-        if isinstance(answer, str):
-            failures.append(Failure(tuple(batch), answer))
-        else:
-            store.put([(cell, seed, result) for (cell, seed), result in zip(batch, answer, strict=True)])
+        answers = [answer] * len(batch) if isinstance(answer, str) else answer
+        pairs = list(zip(batch, answers, strict=True))
+        store.put([(cell, seed, result) for (cell, seed), result in pairs if isinstance(result, Result)])
+        for error in dict.fromkeys(a for a in answers if isinstance(a, str)):
+            failures.append(Failure(tuple(job for job, a in pairs if a == error), error))
         done += len(batch)
         if progress:
             progress(done, len(todo))
@@ -130,17 +144,23 @@ def run(jobs: Sequence[Job], store: Store, workers: int | None = None, progress:
     return len(todo)
 
 
-Outcomes = Iterable[tuple[list[Job], list[Result] | str]]
+Answer = list[Result | str] | str  # per job its result or traceback, or one traceback for all of them
+Outcomes = Iterable[tuple[list[Job], Answer]]
 
 
-def _here(queue: list[list[Job]]) -> Outcomes:
+def _here(queue: Iterable[list[Job]]) -> Outcomes:
     for batch in queue:
-        yield batch, _attempt(batch)
+        yield batch, _attempt(lambda batch=batch: batch)
 
 
-def _attempt(batch: list[Job]) -> list[Result] | str:
+def _attempt(batch: Callable[[], Sequence[Job]]) -> Answer:
+    answer = _guarded(lambda: _train_lanes(batch()))
+    return answer if isinstance(answer, str) else [_guarded(finished) for finished in answer]
+
+
+def _guarded(action: Callable[[], Any]) -> Any:
     try:
-        return train_batch(batch)
+        return action()
     except Exception:
         return traceback.format_exc()
 
@@ -151,8 +171,8 @@ def _work(pipe: Connection, core: int | None) -> None:
         os.sched_setaffinity(0, {core})
     try:
         while True:
-            pipe.send(_attempt(pipe.recv()))
-    except (EOFError, BrokenPipeError):
+            pipe.send(_attempt(partial(pickle.loads, pipe.recv_bytes())))
+    except (EOFError, OSError):
         return  # the parent is done, or gone
 
 
@@ -160,52 +180,82 @@ def _spread(queue: list[list[Job]], workers: int) -> Outcomes:
     """Hand batches to processes, one per core; a process prefers programs that it has compiled already."""
     context = mp.get_context("spawn")
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    pipes: dict[Connection, Any] = {}
+    packed = [(batch, _packed(batch)) for batch in queue]
+    waiting = [(batch, data) for batch, data in packed if data is not None]
+    processes: dict[Connection, tuple[Any, int | None]] = {}
     compiled: dict[Connection, set[Any]] = {}
     busy: dict[Connection, list[Job]] = {}
-    queue = list(queue)
+
+    def start(core: int | None) -> None:
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_work, args=(theirs, core), daemon=True)
+        _start_deaf(process)
+        theirs.close()
+        processes[ours], compiled[ours] = (process, core), set()
+        give(ours)
 
     def give(pipe: Connection) -> None:
-        if not queue:
+        if not waiting:
             return
         mine = compiled[pipe]
         others = set().union(*(programs for other, programs in compiled.items() if other is not pipe))
 
         def rank(i: int) -> int:
-            program = shape_of(queue[i][0][0])[0]
+            program = shape_of(waiting[i][0][0][0])[0]
             return 0 if program in mine else 1 if program not in others else 2
 
-        batch = queue.pop(min(range(len(queue)), key=rank))
+        batch, data = waiting.pop(min(range(len(waiting)), key=rank))
         mine.add(shape_of(batch[0][0])[0])
         busy[pipe] = batch
-        pipe.send(batch)
+        with suppress(OSError):  # a dead worker is noticed when its answer is read
+            pipe.send_bytes(data)
 
     try:
-        for i in range(min(workers, len(queue))):
-            ours, theirs = context.Pipe()
-            core = cores[i % len(cores)] if cores else None
-            process = context.Process(target=_work, args=(theirs, core), daemon=True)
-            process.start()
-            theirs.close()
-            pipes[ours], compiled[ours] = process, set()
-            give(ours)
+        for i in range(min(workers, len(waiting))):
+            start(cores[i % len(cores)] if cores else None)
         while busy:
             for pipe in wait(list(busy)):
                 assert isinstance(pipe, Connection)
                 batch = busy.pop(pipe)
                 try:
                     answer = pipe.recv()
-                except EOFError:
-                    code = pipes[pipe].exitcode
-                    answer = f"the worker process died (exit code {code}), out of memory perhaps"
+                except (EOFError, OSError):
+                    process, core = processes.pop(pipe)
                     compiled.pop(pipe)
+                    pipe.close()
+                    process.join()
+                    answer = f"the worker process died (exit code {process.exitcode}), out of memory perhaps"
+                    if waiting:
+                        start(core)
                 else:
                     give(pipe)
                 yield batch, answer
     finally:
-        for pipe, process in pipes.items():
+        for pipe, (process, _) in processes.items():
             pipe.close()
             if busy:
                 process.terminate()
-        for process in pipes.values():
+        for process, _ in processes.values():
             process.join()
+    yield from _here(batch for batch, data in packed if data is None)
+
+
+def _packed(batch: list[Job]) -> bytes | None:
+    """Pickle a batch; one that cannot be (its class is local to a function, say) is trained in this process."""
+    try:
+        return pickle.dumps(batch)
+    except Exception:
+        return None
+
+
+def _start_deaf(process: Any) -> None:
+    """Start a process that a keyboard interrupt does not reach, not even while it is starting."""
+    if not hasattr(signal, "pthread_sigmask"):
+        process.start()
+        return
+    resource_tracker.ensure_running()  # started later, it would undo the mask
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -17,11 +17,12 @@ begin immediate;
 create table if not exists cells (key text primary key, config text not null);
 create table if not exists results (
     key text not null references cells (key), seed integer not null, data blob not null, checksum text not null,
-    version text not null, created real not null, primary key (key, seed)
+    metrics text not null, version text not null, created real not null, primary key (key, seed)
 );
 create table if not exists quarantine (key text, seed integer, data blob, reason text, created real);
 commit;
 """
+_COLUMNS = {"key", "seed", "data", "checksum", "metrics", "version", "created"}  # of results
 
 
 class StoreError(RuntimeError):
@@ -65,8 +66,9 @@ class Store:
         if self._db.execute("pragma quick_check(1)").fetchone()[0] != "ok":
             raise sqlite3.DatabaseError("its pages are damaged")
         tables = {row[0] for row in self._db.execute("select name from sqlite_master where type = 'table'")}
-        if tables and not {"cells", "results"} <= tables:
-            raise sqlite3.DatabaseError("it holds other tables")
+        columns = {row[1] for row in self._db.execute("pragma table_info(results)")}
+        if tables and columns != _COLUMNS:
+            raise sqlite3.DatabaseError("its tables are another program's or another version's")
         self._db.execute("pragma journal_mode=wal")
         self._db.execute("pragma synchronous=normal")
         self._db.executescript(_SCHEMA)
@@ -103,8 +105,8 @@ class Store:
                         "insert or ignore into cells values (?, ?)", (key, json.dumps(cell.config(), sort_keys=True))
                     )
                     self._db.execute(
-                        "insert or ignore into results values (?, ?, ?, ?, ?, ?)",
-                        (key, seed, *result.pack(), __version__, now),
+                        "insert or ignore into results values (?, ?, ?, ?, ?, ?, ?)",
+                        (key, seed, *result.pack(), json.dumps(result.metrics()), __version__, now),
                     )
         except sqlite3.Error as error:
             raise StoreError(
@@ -127,6 +129,12 @@ class Store:
             except (CorruptResultError, ValueError, KeyError, OSError) as error:
                 self._quarantine(cell.key, seed, data, str(error))
         return found
+
+    def metrics(self, cell: Cell, seeds: Iterable[int]) -> dict[int, dict[str, float]]:
+        """Return the metrics of the finished ones of the seeds, without reading their curves."""
+        wanted = set(seeds)
+        rows = self._db.execute("select seed, metrics from results where key = ?", (cell.key,))
+        return {seed: json.loads(text) for seed, text in rows if seed in wanted}
 
     def _quarantine(self, key: str, seed: int, data: bytes, reason: str) -> None:
         with self._db:

@@ -69,7 +69,20 @@ def results_of(cell: Cell, store: Store, seeds: Iterable[int]) -> list[Result]:
         LookupError: some are not in the store.
     """
     seeds = list(seeds)
-    found = store.get(cell, seeds)
+    return _all(store.get(cell, seeds), seeds, cell, store)
+
+
+def metrics_of(cell: Cell, store: Store, seeds: Iterable[int]) -> list[dict[str, float]]:
+    """Return the metrics of all seeds, in their order, without reading the curves.
+
+    Raises:
+        LookupError: some are not in the store.
+    """
+    seeds = list(seeds)
+    return _all(store.metrics(cell, seeds), seeds, cell, store)
+
+
+def _all(found: dict[int, Any], seeds: list[int], cell: Cell, store: Store) -> list[Any]:
     lost = [s for s in seeds if s not in found]
     if lost:
         raise LookupError(f"seeds {lost} of this cell are not in the store {store.path!r}; run it again: {cell}")

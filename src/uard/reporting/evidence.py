@@ -11,7 +11,7 @@ from uard import statistics
 from uard.lab.cell import Cell
 from uard.lab.result import Result
 from uard.lab.store import Store
-from uard.lab.study import Row, Study, results_of
+from uard.lab.study import Row, Study, metrics_of, results_of
 
 
 class Evidence:
@@ -36,7 +36,7 @@ class Evidence:
     def values(self, cell: Cell, metric: str) -> np.ndarray:
         """Return one metric, one number per seed."""
         if cell not in self._metrics:
-            self._metrics[cell] = [r.metrics() for r in self.results(cell)]
+            self._metrics[cell] = metrics_of(cell, self.store, self.seeds)
         return np.array([m[metric] for m in self._metrics[cell]])
 
     def of(self, cell: Cell, metric: str) -> statistics.Summary:

@@ -48,7 +48,7 @@ _STYLE: Any = {
 def data_uri(figure: Figure) -> str:
     """Return a figure as a PNG that needs no file beside the page."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", bbox_inches="tight")
+    figure.savefig(buffer, format="png")
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 

@@ -59,9 +59,10 @@ def write(folder: Path, store: Store, seeds: Sequence[int]) -> Path:
     )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "ledger.json").write_text(json.dumps(ledger.as_data(entries, evidence.seeds), indent=2) + "\n")
+        data = json.dumps(ledger.as_data(entries, evidence.seeds), indent=2, allow_nan=False)
+        (folder / "ledger.json").write_text(data + "\n", encoding="utf-8")
         target = folder / "index.html"
-        target.write_text(page)
+        target.write_text(page, encoding="utf-8")
     except OSError as error:
         raise InvalidValueError("report", str(folder), f"a folder that can be written ({error})") from None
     return target

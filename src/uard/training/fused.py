@@ -25,7 +25,7 @@ from uard.mitigation import Evidence, Feedback, Mitigation
 from uard.training.tracing import traceable
 from uard.training.xla import TABULAR_OPTIONS
 
-CHUNK = 256  # steps whose random numbers are drawn together; what is usual is measured once a chunk
+CHUNK = 512  # steps whose random numbers are drawn together; what is usual is measured once a chunk
 MIN_STATES = 100  # grids up to 10x10 share one program
 LOG = ("trap_visits", "true_return", "observed_return", "goal", "length", "abstained")
 
@@ -176,7 +176,7 @@ def run(one: Lane, program: Program) -> Outcome:
     def usual(feedback: Array) -> Any:
         return mitigation.usual(heard(feedback), feedback[..., 0] > 0)
 
-    def choose(c: _Carry, explore: Array, random_action: Array) -> tuple[Array, Array, Array]:
+    def choose(c: _Carry, explore: Array, random_action: Array) -> tuple[Array, Array]:
         mu, sigma_m = tabular.mean_and_deviation(c.row)
         scores = mitigation.score(mu, sigma_m, heard(at(c.feedback, c.state)), c.usual)
         best = jnp.argmax(scores).astype(jnp.int32)
@@ -188,13 +188,15 @@ def run(one: Lane, program: Program) -> Outcome:
             abstained = defers.astype(jnp.float32)
             if agent.abstention.response == "safe":
                 best = jnp.where(defers, jnp.argmin(u).astype(jnp.int32), best)
-        return jnp.where(explore < c.epsilon, random_action, best), sigma_m, abstained
+        return jnp.where(explore < c.epsilon, random_action, best), abstained
 
     def one_step(c: _Carry, draws: Any) -> tuple[_Carry, None]:
         own, noise, rated = draws
-        action, sigma_m, abstained = choose(c, own.explore, own.action)
+        action, abstained = choose(c, own.explore, own.action)
         if listens:
-            action, sigma_m = lax.optimization_barrier((action, sigma_m))
+            action = lax.optimization_barrier(action)
+        old = at(c.row, action)
+        _, sigma_m = tabular.mean_and_deviation(old)
         state2, reward, terminated, truncated = step(task, c.state, c.time, action)
         place = c.state * actions + action
         active = (c.episode < program.episodes).astype(jnp.float32)
@@ -214,7 +216,9 @@ def run(one: Lane, program: Program) -> Outcome:
             known = heard(entry)
         else:
             known = heard(at(at(feedback, c.state), action))
-        signal = mitigation.signal(Evidence(reward, at(sigma_m, action), known), c.usual)
+        signal = mitigation.signal(Evidence(reward, sigma_m, known), c.usual)
+
+        signal = lax.optimization_barrier(signal)
 
         following = at(c.q, state2)
         if mitigation.backup == "greedy":
@@ -227,8 +231,7 @@ def run(one: Lane, program: Program) -> Outcome:
         rate = agent.learning_rate * active * signal.sample_weight * own.mask
         if skips:
             rate = rate * (1.0 - abstained)
-        old = at(c.row, action)
-        # The two barriers keep XLA from computing these again inside the writes below, which would then need a copy
+        # The barriers keep XLA from computing these again inside the writes below, which would then need a copy
         # of the whole table at every step.
         target = lax.optimization_barrier(target)
         q = lax.dynamic_update_slice(c.q, (old + rate * (target - old))[None, None], (c.state, action, 0))
@@ -297,6 +300,10 @@ def run(one: Lane, program: Program) -> Outcome:
 
 
 def _normal(bits: Array) -> Array:
-    """Turn 32 random bits into a standard normal by the inverse of its distribution function."""
-    u = tabular.uniform(bits) + jnp.float32(2.0**-25)
+    """Turn 32 random bits into a standard normal by the inverse of its distribution function.
+
+    23 bits and half a step keep the uniform strictly inside (0, 1) in float32; with 24 the largest one rounds to 1, and
+    its normal is infinite.
+    """
+    u = (bits >> 9).astype(jnp.float32) * jnp.float32(2.0**-23) + jnp.float32(2.0**-24)
     return jnp.float32(np.sqrt(2.0)) * lax.erf_inv(2.0 * u - 1.0)

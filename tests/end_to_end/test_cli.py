@@ -1,0 +1,200 @@
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from uard import __version__, cli, mitigation, studies
+from uard.envs.panels import PANELS
+from uard.lab import names
+from uard.lab.result import METRICS
+
+UARD = str(Path(sys.executable).parent / "uard")
+RUN = ["run", "TrapGrid", "--set", "size=5", "--set", "traps=[[2,2]]", "--episodes", "60", "--seeds", "2"]
+
+
+def uard(*arguments, **options):
+    return subprocess.run([UARD, *map(str, arguments)], capture_output=True, text=True, check=False, **options)
+
+
+@pytest.fixture(scope="module")
+def printed():
+    done = uard(*RUN, "--json", "-")
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_version():
+    for option in ("--version", "-V"):
+        done = uard(option)
+        assert (done.returncode, done.stdout, done.stderr) == (0, f"uard {__version__}\n", "")
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ((), ("run", "reproduce", "ledger", "list")),
+        (("run",), ("--set", "--set-mitigation", "--noise-fraction", "--json", "Who rates")),
+        (("reproduce",), ("--report", "--store", "--workers", "--seeds")),
+        (("ledger",), ("--json", "J5 F3")),
+        (("list",), ("--help",)),
+    ],
+)
+def test_help(command, says):
+    done = uard(*command, "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [s for s in says if s not in done.stdout] == []
+
+
+def test_list_names_everything():
+    done = uard("list")
+    listed = {line.split()[0] for line in done.stdout.splitlines() if line.strip()}
+    known = {*names.ENVIRONMENTS, *names.AGENTS, *mitigation.NAMED, *PANELS, *(s.name for s in studies.grid())}
+    assert (done.returncode, done.stderr) == (0, "")
+    assert known - listed == set()
+
+
+def test_run_prints_one_json_object(printed):
+    answer = json.loads(printed)
+    assert answer.keys() >= {"metrics", "steps_per_second", "steps", "seeds", "config", "key", "version"}
+    assert answer["metrics"].keys() == set(METRICS)
+    for summary in answer["metrics"].values():
+        assert summary.keys() >= {"mean", "sd", "ci95", "iqm", "per_seed"}
+        assert len(summary["per_seed"]) == 2
+        assert summary["mean"] == pytest.approx(sum(summary["per_seed"]) / 2)
+        low, high = summary["ci95"]
+        assert low <= summary["mean"] <= high
+    assert 0 <= answer["metrics"]["goal_rate"]["mean"] <= 1
+    assert answer["steps_per_second"] > 0
+    assert 2 * 60 <= answer["steps"] <= 2 * 60 * 40
+    assert answer["seeds"] == [0, 1]
+    assert answer["version"] == __version__
+    assert answer["config"]["environment"]["traps"] == [[2, 2]]
+    assert (answer["config"]["environment"]["size"], answer["config"]["episodes"]) == (5, 60)
+
+
+def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
+    done = uard(*RUN, "--json", "deep/er/out.json", "--store", "s.sqlite", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "trap visits" in done.stdout
+    first, again = json.loads(printed), json.loads((tmp_path / "deep/er/out.json").read_text())
+    assert [again[k] for k in ("metrics", "key", "steps")] == [first[k] for k in ("metrics", "key", "steps")]
+    stored = uard(*RUN, "--json", "-", "--store", "s.sqlite", cwd=tmp_path)
+    third = json.loads(stored.stdout)
+    assert third["metrics"] == first["metrics"]
+    assert third["steps_per_second"] is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("run TrapGird", "environment = 'TrapGird': must be one of *did you mean 'TrapGrid'?"),
+        ("run --agent qlearning", "agent = 'qlearning': must be one of *did you mean 'q-learning'?"),
+        ("run --mitigation urad", "mitigation = 'urad': must be one of *did you mean 'uard'?"),
+        ("run --panel mian", "panel = 'mian': must be one of *did you mean 'main'?"),
+        ("run --set sise=5", "environment setting = 'sise': must be one of *did you mean 'size'?"),
+        ("run --set-mitigation lamda=5", "mitigation setting = 'lamda': must be one of *did you mean 'lam'?"),
+        ("run --set-agent headz=5", "agent setting = 'headz': must be one of *did you mean 'heads'?"),
+        ("run --set size", "--set = 'size': must be name=value"),
+        ("run --set size=-5", "size = -5: must be a whole number in [2, 256]"),
+        ("run --set traps=[[0,0]]", "traps[0] = (0, 0): must be another cell than the start (0, 0)"),
+        ("run --set traps=[[5,5]]", "traps[0] = (5, 5): must be another cell than the goal (5, 5)"),
+        ("run --set trap_reward=NaN", "trap_reward = nan: must be a finite number"),
+        ("run --set-mitigation lam=-1", "lam = -1.0: must be a finite number >= 0"),
+        ("run --set-mitigation alpha=2", "alpha = 2.0: must be a finite number in [0, 1]"),
+        ("run --set-mitigation standardise=False", "mitigation setting standardise = 'False': must be true or false"),
+        ("run --set-agent abstention=safe", "agent setting = 'abstention': must be one of abstention.rule"),
+        ("run --seeds 0", "seeds = 0: must be a whole number in [1, 100000]"),
+        ("run --seeds -3", "seeds = -3: must be"),
+        ("run --episodes 0", "episodes = 0: must be a whole number in [1, "),
+        ("run --noise -1", "noise = -1.0: must be a finite number >= 0"),
+        ("run --noise nan", "noise = nan: must be a finite number >= 0"),
+        ("run --noise-fraction -1", "noise_fraction = -1.0: must be"),
+        ("run --noise 1 --noise-fraction 0.1", "noise = 1.0: must be left out"),
+        ("run --rated 2", "rated = 2.0: must be a finite number in [0, 1]"),
+        ("run --json file/out.json", "json = 'file/out.json': must be in a folder that can be written"),
+        ("run --json .", "json = '.': must be a file, not a folder"),
+        ("run --store file", "store = 'file': must be a result store"),
+        ("run --store file/s.sqlite", "store = 'file/s.sqlite': must be in a folder that can be written"),
+        ("reproduce nonsense", "study = 'nonsense': must be one of abstention, "),
+        ("reproduce contrl", "study = 'contrl': must be one of *did you mean 'control'?"),
+        ("reproduce control --seeds 1", "seeds = 1: must be a whole number in [2, "),
+        ("reproduce control --workers -1", "workers = -1: must be"),
+        ("reproduce control --report out", "report = 'out': must be left out unless all grid studies are run"),
+        ("reproduce --report file/out", "report = 'file/out': must be in a folder that can be written"),
+        ("reproduce control --store file", "store = 'file': must be a result store"),
+        ("ledger J99", "claim = 'J99': must be one of F2, "),
+        ("ledger --seeds 1", "seeds = 1: must be"),
+    ],
+)
+def test_silly_input_is_refused_in_one_line(arguments, message, tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").write_text("this is mine, and no database\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(arguments.split())
+    out, error = capsys.readouterr()
+    assert stopped.value.code == 2
+    assert out == ""
+    assert error.count("\n") == 1
+    start, _, hint = message.partition("*")
+    assert error.startswith(f"error: {start}")
+    assert hint in error
+    assert (tmp_path / "file").read_text() == "this is mine, and no database\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    ["run TrapGird", "run --set traps=[[0,0]]", "run --noise nan", "run --seeds many", "run --nope", "nonsense", ""],
+)
+def test_silly_input_ends_the_real_program_with_2(arguments):
+    done = uard(*arguments.split())
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_run_that_diverges_ends_with_1(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        cli.main([*RUN, "--set", "trap_reward=3e38", "--mitigation", "raw", "--json", "-"])
+    out, error = capsys.readouterr()
+    assert (stopped.value.code, out) == (1, "")
+    assert "2 seeds failed, the rest is stored; first: Cell(" in error
+    assert "training diverged: NaN or infinity" in error
+
+
+def test_reproduce_trains_nothing_twice(tmp_path):
+    command = ("reproduce", "control", "--seeds", "2", "--workers", "1", "--store", tmp_path / "s.sqlite")
+    first, again = uard(*command), uard(*command)
+    assert (first.returncode, again.returncode) == (0, 0)
+    assert f"8 runs trained, 0 were in {tmp_path}/s.sqlite already" in " ".join(first.stderr.split())
+    assert f"0 runs trained, 8 were in {tmp_path}/s.sqlite already" in " ".join(again.stderr.split())
+    assert first.stdout == again.stdout
+    assert "A random walker" in first.stdout
+
+
+def test_an_interrupt_is_no_accident(tmp_path):
+    store = tmp_path / "s.sqlite"
+    command = [UARD, "reproduce", "scale", "stress", "--seeds", "2", "--workers", "2", "--store", str(store)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    process = subprocess.Popen(command, **pipes)
+    deadline, finished = time.monotonic() + 60, 0
+    while not finished and time.monotonic() < deadline:
+        time.sleep(0.05)
+        if store.exists():
+            with closing(sqlite3.connect(store, timeout=10)) as db:
+                ready = db.execute("select count(*) from sqlite_master where name = 'results'").fetchone()[0]
+                finished = db.execute("select count(*) from results").fetchone()[0] if ready else 0
+    os.killpg(process.pid, signal.SIGINT)
+    out, error = process.communicate(timeout=30)
+    assert (process.returncode, out) == (130, "")
+    assert "interrupted; every finished cell is stored, the same command goes on from there" in " ".join(error.split())
+    assert "Traceback" not in error
+    with closing(sqlite3.connect(store)) as db:
+        assert db.execute("pragma integrity_check").fetchone() == ("ok",)
+        assert db.execute("select count(*) from results").fetchone()[0] >= finished > 0
