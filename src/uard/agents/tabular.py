@@ -78,15 +78,15 @@ def uniform(bits: Array) -> Array:
 
 def words(agent: QLearning) -> int:
     """Return how many 32-bit words ``draw`` needs for one step."""
-    return 2 + -(-agent.heads // 4)
+    return 1 + -(-agent.heads // 4)
 
 
 def draw(agent: QLearning, bits: Array, actions: int) -> Draws:
     """Turn (C, words) random bits into the draws of C steps."""
     shifts = 8 * (jnp.arange(agent.heads, dtype=jnp.uint32) % 4)
-    bytes_ = (bits[:, 2:][:, jnp.arange(agent.heads) // 4] >> shifts) & 255
+    bytes_ = (bits[:, 1:][:, jnp.arange(agent.heads) // 4] >> shifts) & 255
     chosen = bytes_.astype(jnp.float32) < agent.bootstrap * 256.0
-    action = jnp.minimum((uniform(bits[:, 1]) * actions).astype(jnp.int32), actions - 1)
+    action = (((bits[:, 0] & 255) * actions) >> 8).astype(jnp.int32)  # the eight bits that ``uniform`` leaves
     return Draws(uniform(bits[:, 0]), action, chosen.astype(jnp.float32))
 
 
