@@ -115,10 +115,15 @@ def test_a_finished_seed_is_never_run_again_and_a_corrupt_one_is(store, path):
     assert store.quarantined() == [(TINY.key, 1, "checksum does not match")]
 
 
+def misstate(path, seed):
+    raw(path, "update results set metrics = replace(metrics, '0', '1') where seed = ?", seed)
+
+
+@pytest.mark.parametrize("damage", [corrupt, misstate])
 @pytest.mark.parametrize("ask", [lambda s: s.get(CELL, [0, 1, 2]), lambda s: s.have(CELL)])
-def test_a_corrupt_result_is_quarantined_once(store, path, ask):
+def test_a_corrupt_result_is_quarantined_once(store, path, ask, damage):
     store.put([(CELL, seed, result(seed)) for seed in range(3)])
-    corrupt(path, 1)
+    damage(path, 1)
     assert set(ask(store)) == set(ask(store)) == {0, 2}
     assert store.missing(CELL, range(3)) == [1]
     assert store.quarantined() == [(CELL.key, 1, "checksum does not match")]

@@ -74,7 +74,7 @@ class TrapGrid:
             put(self, "horizon", PAPER_HORIZON.get(size, 8 * size))
         _checks.whole("horizon", self.horizon, low=1, high=100_000)
         for name in ("trap_reward", "true_trap_reward", "goal_reward", "step_reward"):
-            _checks.number(name, getattr(self, name))
+            _checks.number(name, getattr(self, name), low=-1e30, high=1e30)  # the tables are float32
             put(self, name, float(getattr(self, name)))
         if not isinstance(self.legitimate, bool):
             raise _checks.InvalidValueError("legitimate", self.legitimate, "true or false")

@@ -79,11 +79,7 @@ class Store:
 
     def have(self, cell: Cell) -> set[int]:
         """Return the seeds that are finished; a corrupt one is quarantined as by ``get``."""
-        rows = self._db.execute("select seed, data, checksum from results where key = ?", (cell.key,)).fetchall()
-        damaged = {seed: data for seed, data, checksum in rows if digest(data) != checksum}
-        for seed, data in damaged.items():
-            self._quarantine(cell.key, seed, data, "checksum does not match")
-        return {row[0] for row in rows} - damaged.keys()
+        return {seed for seed, _ in self._sound(cell)}
 
     def missing(self, cell: Cell, seeds: Iterable[int]) -> list[int]:
         """Return those of the seeds that are not finished."""
@@ -100,13 +96,13 @@ class Store:
         try:
             with self._db:
                 for cell, seed, result in finished:
-                    key = cell.key
+                    key, data, metrics = cell.key, result.pack()[0], json.dumps(result.metrics())
                     self._db.execute(
                         "insert or ignore into cells values (?, ?)", (key, json.dumps(cell.config(), sort_keys=True))
                     )
                     self._db.execute(
                         "insert or ignore into results values (?, ?, ?, ?, ?, ?, ?)",
-                        (key, seed, *result.pack(), json.dumps(result.metrics()), __version__, now),
+                        (key, seed, data, digest(data + metrics.encode()), metrics, __version__, now),
                     )
         except sqlite3.Error as error:
             raise StoreError(
@@ -120,21 +116,34 @@ class Store:
         """
         wanted = set(seeds)
         found: dict[int, Result] = {}
-        rows = self._db.execute("select seed, data, checksum from results where key = ?", (cell.key,)).fetchall()
-        for seed, data, checksum in rows:
+        for seed, data in self._sound(cell):
             if seed not in wanted:
                 continue
             try:
-                found[seed] = Result.unpack(data, checksum)
+                found[seed] = Result.unpack(data, digest(data))
             except (CorruptResultError, ValueError, KeyError, OSError) as error:
                 self._quarantine(cell.key, seed, data, str(error))
         return found
 
     def metrics(self, cell: Cell, seeds: Iterable[int]) -> dict[int, dict[str, float]]:
-        """Return the metrics of the finished ones of the seeds, without reading their curves."""
+        """Return the metrics of the finished ones of the seeds, without reading their curves.
+
+        They are as sound as they were when ``have`` last looked.
+        """
         wanted = set(seeds)
         rows = self._db.execute("select seed, metrics from results where key = ?", (cell.key,))
         return {seed: json.loads(text) for seed, text in rows if seed in wanted}
+
+    def _sound(self, cell: Cell) -> list[tuple[int, bytes]]:
+        """Return seed and bytes of every result whose checksum matches, and quarantine the others."""
+        query = "select seed, data, metrics, checksum from results where key = ?"
+        sound = []
+        for seed, data, metrics, checksum in self._db.execute(query, (cell.key,)).fetchall():
+            if digest(data + metrics.encode()) == checksum:
+                sound.append((seed, data))
+            else:
+                self._quarantine(cell.key, seed, data, "checksum does not match")
+        return sound
 
     def _quarantine(self, key: str, seed: int, data: bytes, reason: str) -> None:
         with self._db:
