@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 Array = Any
+MIN_STATES = 100  # tables are padded to this many states, so that grids up to 10x10 share one program
 
 
 class Task(NamedTuple):

@@ -15,6 +15,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from uard.envs.tabular import MIN_STATES
 from uard.lab.cell import Cell
 from uard.lab.result import Result
 from uard.lab.store import Store
@@ -54,7 +55,7 @@ def shape_of(cell: Cell) -> tuple[Any, ...]:
         return "number" if isinstance(value, float) else str(value)
 
     agent, mitigation = structure(plain(cell.agent)), structure(plain(cell.mitigation))
-    room = max(100, cell.environment.states)
+    room = max(MIN_STATES, cell.environment.states)
     raters = 1 if cell.panel == "single" else 3
     program = (mitigation, agent, room, raters, cell.episodes, cell.ddof, cell.snapshots)
     return program, (cell.environment.horizon or 0) * cell.episodes

@@ -19,14 +19,14 @@ from jax import Array, lax
 
 from uard.agents import tabular
 from uard.agents.tabular import QLearning
-from uard.envs.tabular import HiddenTruth, Ratings, Task, at, pad, step
+from uard.envs.tabular import MIN_STATES, HiddenTruth, Ratings, Task, at, pad, step
 from uard.feedback import running
 from uard.mitigation import Evidence, Feedback, Mitigation
 from uard.training.tracing import traceable
 from uard.training.xla import TABULAR_OPTIONS
 
 CHUNK = 512  # steps whose random numbers are drawn together; what is usual is measured once a chunk
-MIN_STATES = 100  # grids up to 10x10 share one program
+ROOM = 64  # a program has room for this many lanes, or a multiple: fewer are no reason to compile again
 LOG = ("trap_visits", "true_return", "observed_return", "goal", "length", "abstained")
 
 
@@ -103,7 +103,7 @@ def train(
     lanes: list[Lane], program: Program, fields: tuple[str, ...] = ("log", "steps")
 ) -> list[dict[str, np.ndarray]]:
     """Train all lanes, which must agree in everything that is not a number, and return the asked-for fields."""
-    room = 1 << (len(lanes) - 1).bit_length()
+    room = -(-len(lanes) // ROOM) * ROOM
     filled = lanes + [lanes[-1]] * (room - len(lanes))
     stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(x, _narrow(x)) for x in leaves]), *filled)
     out = _train(stacked, np.int32(len(lanes)), program, fields)
