@@ -622,7 +622,7 @@ def _j29(e: Evidence) -> _Answer:
         for a in ("uard-paper", "random walk", "uard")
     )
     printed = paper.TABLE_3[-1].reward.mean
-    why = f"{printed:g} is what a random walker earns ({number(walker.mean)}); the repaired `uard` earns {number(best.mean)} on the same grid with the same ratings."
+    why = f"A random walker, too, earns about as much as the printed {printed:g} ({number(walker.mean)} here), and UARD as printed less; the repaired `uard` earns {number(best.mean)} on the same grid with the same ratings."
     return (
         "study table3, T = 100, observed return",
         f"uard-paper {full(ours)}; random walk {full(walker)}; uard {full(best)}",

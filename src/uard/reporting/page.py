@@ -95,7 +95,7 @@ def _losses(e: Evidence) -> list[str]:
     worst = min(e.of(r.cell, "trap_visits").mean / e.of(r.cell, "episode_length").mean for r in fooled)
     out.append(
         f"Colluding raters (all repeat the proxy): uard hacks in {len(fooled)} of {len(fooled)} settings, at least "
-        f"{worst:.2f} trap visits per step. It reads agreement as truth; this control must fail, and does."
+        f"{worst:.2f} trap visits per step. It reads agreement as truth; this control must fail, and does. {_escaped(e)}"
     )
     target = [
         r
@@ -114,7 +114,7 @@ def _losses(e: Evidence) -> list[str]:
     )
     for study, shown in (("matrix", ("size", "trap", "panel", "noise")), ("budgets", ("panel", "noise", "rated"))):
         beaten = []
-        rows = list(e.studies[study].where(mitigation="uard"))
+        rows = [r for r in e.studies[study].where(mitigation="uard") if r["panel"] != "colluding"]
         for r in rows:
             labels = {k: r[k] for k in shown}
             mine = e.of(r.cell, "true_return")
@@ -138,6 +138,23 @@ def _losses(e: Evidence) -> list[str]:
                 f"10x10, {panel} panel, noise sd {noise:g}: highest true return {first} {full(best)}, then {runner} {full(second)}."
             )
     return out
+
+
+def _escaped(e: Evidence) -> str:
+    """Say who escapes colluding raters, and where most."""
+    gains = []
+    for r in e.studies["matrix"].where(panel="colluding"):
+        mine = e.row("matrix", **(dict(r.labels) | {"mitigation": "uard"})).cell
+        if r["mitigation"] != "uard" and _better(e.of(r.cell, "true_return"), e.of(mine, "true_return")):
+            gains.append((e.of(r.cell, "true_return").mean - e.of(mine, "true_return").mean, r, mine))
+    if not gains:
+        return ""
+    _, best, mine = max(gains, key=lambda g: g[0])
+    return (
+        f"In {len(gains)} comparisons another mitigation does better there, most of all {best['mitigation']} ({_name(best)}): "
+        f"{brief(e.of(best.cell, 'true_return'))} against {brief(e.of(mine, 'true_return'))}; very noisy raters make it shun "
+        "whatever they rate."
+    )
 
 
 def _name(r: Row) -> str:
