@@ -157,7 +157,7 @@ def uncertainty(e: Evidence) -> Figure:
         axis.axhline(paper.SIGMA_H_AT_TRAP, color="k", lw=1, ls="--")
         axis.annotate("1.247 in the paper", (10, paper.SIGMA_H_AT_TRAP + 0.02), fontsize=9)
         axis.set(xlabel="episode", ylabel="uncertainty", title=f"uard-paper, 6x6, {panel} panel", ylim=(0, None))
-    axes[0].legend()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
 
 

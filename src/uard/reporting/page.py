@@ -317,7 +317,11 @@ def _figures(e: Evidence) -> list[tuple[str, str, str]]:
             "The baseline's observed and true return part; those of `uard` meet.",
         ),
         ("G8 · true return", figures.true_return, "UARD as printed settles at -4: forty steps of -0.1."),
-        ("G9 · two uncertainties", figures.uncertainty, "sigma_m falls, sigma_h stays. Bands are one SD over seeds."),
+        (
+            "G9 · two uncertainties",
+            figures.uncertainty,
+            "Bootstrapped heads. sigma_m at the trap falls after its peak, elsewhere it grows with the values; sigma_h stays. Bands are one SD over seeds.",
+        ),
         (
             "G11 on the grid · noisy raters",
             figures.noise,
