@@ -161,7 +161,7 @@ def test_silly_input_ends_the_real_program_with_2(arguments):
 
 def test_a_run_that_diverges_ends_with_1(capsys):
     with pytest.raises(SystemExit) as stopped:
-        cli.main([*RUN, "--set", "trap_reward=3e38", "--mitigation", "raw", "--json", "-"])
+        cli.main([*RUN, "--set-agent", "init_scale=3e38", "--mitigation", "raw", "--json", "-"])
     out, error = capsys.readouterr()
     assert (stopped.value.code, out) == (1, "")
     assert "2 seeds failed, the rest is stored; first: Cell(" in error
