@@ -1,7 +1,8 @@
 """The ledger: every claim of the paper that a grid can answer, what was run, our number, and a verdict.
 
-Every verdict is computed from the numbers by the condition beside it; none is typed in. Claims about deep agents and
-MuJoCo stand here as "cannot be tested" with the reason until those agents exist.
+A verdict on a number is computed from it by the condition beside it. Where a claim has parts that no number answers (a
+derivation, a cross-reference, MuJoCo), that part is our reading of the text, and ``why`` says so. Claims about deep
+agents and MuJoCo stand here as "cannot be tested" with the reason until those agents exist.
 """
 
 from __future__ import annotations
