@@ -21,8 +21,10 @@ class Task(NamedTuple):
         next_state: (S, A) integers.
         reward: (S, A) observed (proxy) reward.
         terminal: (S, A), whether the step ends the episode.
-        start: Starting state.
+        start: Starting state; several, (n,), take turns.
         horizon: Steps after which an episode is cut off.
+        doubt: (S, A) deviation between the members of the model that made the observed reward; None for a reward that
+            was written by hand.
     """
 
     next_state: Array
@@ -30,6 +32,7 @@ class Task(NamedTuple):
     terminal: Array
     start: Array
     horizon: Array
+    doubt: Array | None = None
 
 
 class HiddenTruth(NamedTuple):
@@ -65,10 +68,10 @@ def step(task: Task, state: Array, time: Array, action: Array) -> tuple[Array, A
 def pad(tables: Any, states: int) -> Any:
     """Append unreachable states so that tables of several sizes fit one compiled program."""
 
-    def grow(table: np.ndarray) -> np.ndarray:
-        table = np.asarray(table)
-        if table.ndim < 2:
+    def grow(table: Any) -> Any:
+        if table is None or np.ndim(table) < 2:
             return table
+        table = np.asarray(table)
         extra = np.zeros((states - table.shape[0], *table.shape[1:]), table.dtype)
         return np.concatenate([table, extra])
 

@@ -1,0 +1,185 @@
+"""What an environment is to a compiled training loop: pure functions of a compact state.
+
+A world is a pytree (its numbers are data, so that one program serves many worlds) with the methods of ``World``, each
+for one state; loops map them over batches. What an agent may see of a step is what ``observe``, ``step`` and the panel's
+ratings give. ``judge`` is for evaluation only: loops write it into their log and hand it to no agent, feedback model or
+mitigation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from uard.envs.tabular import MIN_STATES, HiddenTruth, Ratings, Task, pad
+
+
+class Step(NamedTuple):
+    """One step: the state it leads to, the observed reward, whether the episode ends there, the reward's own doubt.
+
+    ``doubt`` is the deviation between the members of the model that made the observed reward; 0 for a reward that was
+    written by hand.
+    """
+
+    state: Any
+    reward: Array
+    terminated: Array
+    doubt: Array
+
+
+class Verdict(NamedTuple):
+    """What a step was really worth, whether it was a hack, whether it reached the goal: for evaluation only."""
+
+    reward: Array
+    hack: Array
+    goal: Array
+
+
+@runtime_checkable
+class World(Protocol):
+    """An episodic environment with discrete actions, its panel of annotators included.
+
+    Attributes:
+        actions: Number of actions.
+        features: Length of an observation.
+        raters: Number of annotators K.
+        slots: ``slot`` is below this.
+        horizon: Steps after which an episode is cut off.
+    """
+
+    @property
+    def actions(self) -> int:
+        """Number of actions."""
+        ...
+
+    @property
+    def features(self) -> int:
+        """Length of an observation."""
+        ...
+
+    @property
+    def raters(self) -> int:
+        """Number of annotators K."""
+        ...
+
+    @property
+    def slots(self) -> int:
+        """``slot`` is below this."""
+        ...
+
+    @property
+    def horizon(self) -> Array:
+        """Steps after which an episode is cut off."""
+        ...
+
+    def reset(self, key: Array) -> Any:
+        """Return an episode's first state: any pytree of small arrays."""
+        ...
+
+    def step(self, state: Any, action: Array, key: Array) -> Step:
+        """Take one step."""
+        ...
+
+    def observe(self, state: Any) -> Array:
+        """Return the observation, (features,) float32."""
+        ...
+
+    def slot(self, state: Any, action: Array) -> Array:
+        """Return a number of the state-action: equal ones have equal numbers; different ones rarely share one."""
+        ...
+
+    def judge(self, state: Any, action: Array, after: Step) -> Verdict:
+        """Say what a step was really worth; for evaluation only."""
+        ...
+
+    def rate(self, state: Any, action: Array, after: Step) -> Ratings:
+        """Return what the panel says of a step: (K,) centre and deviation."""
+        ...
+
+
+@jax.tree_util.register_pytree_node_class
+@dataclass(frozen=True)
+class TableWorld:
+    """A small problem given as tables; the state is a number and its observation one-hot.
+
+    Attributes:
+        task: What an agent meets; ``start`` may hold several states, of which each episode draws one.
+        truth: What the evaluation sees.
+        said: What the panel says of every step.
+    """
+
+    task: Task
+    truth: HiddenTruth
+    said: Ratings
+
+    def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
+        """Give JAX the tables."""
+        return (self.task, self.truth, self.said), None
+
+    @classmethod
+    def tree_unflatten(cls, aux: None, children: Any) -> TableWorld:
+        """Take them back."""
+        return cls(*children)
+
+    @property
+    def actions(self) -> int:
+        """Number of actions."""
+        return self.task.reward.shape[1]
+
+    @property
+    def features(self) -> int:
+        """Number of states."""
+        return self.task.reward.shape[0]
+
+    @property
+    def raters(self) -> int:
+        """Number of annotators."""
+        return self.said.centre.shape[-1]
+
+    @property
+    def slots(self) -> int:
+        """Number of state-actions."""
+        return self.features * self.actions
+
+    @property
+    def horizon(self) -> Array:
+        """Steps per episode."""
+        return self.task.horizon
+
+    def reset(self, key: Array) -> Array:
+        """Draw one of the starts."""
+        starts = jnp.atleast_1d(jnp.asarray(self.task.start, jnp.int32))
+        return starts[0] if starts.shape[0] == 1 else jax.random.choice(key, starts)
+
+    def step(self, state: Array, action: Array, key: Array) -> Step:
+        """Look the step up."""
+        place = state, action
+        task = self.task
+        doubt = jnp.float32(0.0) if task.doubt is None else task.doubt[place]
+        return Step(task.next_state[place], task.reward[place], task.terminal[place], doubt)
+
+    def observe(self, state: Array) -> Array:
+        """Return the state one-hot."""
+        return (jnp.arange(self.features) == state).astype(jnp.float32)
+
+    def slot(self, state: Array, action: Array) -> Array:
+        """Return the number of the state-action; none share one."""
+        return state * self.actions + action
+
+    def judge(self, state: Array, action: Array, after: Step) -> Verdict:
+        """Look the truth up."""
+        return Verdict(*(table[state, action] for table in self.truth))
+
+    def rate(self, state: Array, action: Array, after: Step) -> Ratings:
+        """Look the panel's speech up."""
+        return Ratings(self.said.centre[state, action], self.said.deviation[state, action])
+
+
+def table_world(task: Task, truth: HiddenTruth, said: Ratings, states: int = MIN_STATES) -> TableWorld:
+    """Build a world of tables, padded so that small ones share one compiled program."""
+    states = max(states, task.next_state.shape[0])
+    return TableWorld(pad(task, states), pad(truth, states), pad(said, states))
