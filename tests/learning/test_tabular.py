@@ -17,7 +17,7 @@ from uard.envs import panels
 from uard.envs.tabular import HiddenTruth, Ratings, Task
 from uard.envs.trapgrid import TrapGrid, paper_grid
 from uard.mitigation import NAMED, named
-from uard.training import fused
+from uard.training import fused, lanes
 from uard.training.fused import LOG, Lane, Outcome, Program
 from uard.training.xla import TABULAR_OPTIONS
 
@@ -206,7 +206,7 @@ def test_learning_never_sees_the_truth(name: str):
 
 def test_numbers_do_not_recompile():
     train(on_grid())
-    before = fused._train._cache_size()
+    before = lanes.on_tables._cache_size()
     grid = TrapGrid(size=5, traps=((1, 1), (2, 3)), trap_reward=6.5, goal=(0, 4), horizon=33)
     for lane in (
         on_grid(lam=1.5, alpha=0.2, beta=0.9, kappa=3.0, unrated_weight=0.5, prior_count=0.0),
@@ -217,16 +217,16 @@ def test_numbers_do_not_recompile():
         on_grid(grid=paper_grid(10, 8.0, legitimate=True)),
     ):
         train(lane)
-    assert fused._train._cache_size() == before
+    assert lanes.on_tables._cache_size() == before
 
 
 def test_whole_numbers_are_numbers_too():
     train(on_grid())
-    before = fused._train._cache_size()
+    before = lanes.on_tables._cache_size()
     same(train(on_grid(lam=1, kappa=2))[0], train(on_grid(lam=1.0, kappa=2.0))[0])
     train(on_grid(agent=QLearning(epsilon=1, bootstrap=1, gamma=0)))
-    assert fused._train._cache_size() == before
-    assert fused.signature(on_grid(lam=1)) == fused.signature(on_grid(lam=0.5)), "they fit into one batch"
+    assert lanes.on_tables._cache_size() == before
+    assert lanes.signature(on_grid(lam=1)) == lanes.signature(on_grid(lam=0.5)), "they fit into one batch"
 
 
 @pytest.mark.parametrize("name", ["uard", "mean-of-annotations"])

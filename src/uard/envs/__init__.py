@@ -1,5 +1,7 @@
 """Environments and the panels that rate them; importing this registers the ids ``uard/...`` with Gymnasium."""
 
+from uard.envs import gym_gaming
 from uard.envs.gym import register
 
 register()
+gym_gaming.register()

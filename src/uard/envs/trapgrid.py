@@ -8,11 +8,16 @@ the own cell. The true reward of a trap is -1; the paper never states it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uard import _checks
+from uard.envs import panels
 from uard.envs.tabular import HiddenTruth, Task
+
+if TYPE_CHECKING:
+    from uard.envs.world import TableWorld
 
 MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])  # up, down, left, right
 PAPER_TRAPS = {6: ((3, 3),), 8: ((3, 3), (5, 6)), 10: ((3, 3), (5, 6), (7, 4))}
@@ -118,6 +123,10 @@ class TrapGrid:
         hack = np.isin(entered, [self.state(t) for t in self.traps or ()])
         reward = self._by_cell(self.trap_reward if self.legitimate else self.true_trap_reward)[entered]
         return HiddenTruth(reward, hack, entered == self.state(self.goal))  # type: ignore[arg-type]
+
+    def world(self, panel: str = "main", noise: float = 0.0) -> TableWorld:
+        """Return the compiled world, each step rated by a panel (needs JAX)."""
+        return panels.of_tables(self, panel, noise)
 
 
 def paper_grid(size: int, trap_reward: float = 4.0, **changes: object) -> TrapGrid:

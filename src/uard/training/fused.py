@@ -1,15 +1,11 @@
 """Training of tabular agents as one compiled program.
 
-A *lane* is one run: one environment, panel, mitigation, agent and seed, all of them data. ``train`` runs any number of
-lanes one after the other inside one program (``lax.fori_loop``), which on a CPU beats stepping them side by side: each
-lane's tables stay in the first-level cache and no lane waits for another. The program is compiled once per
-combination of array sizes, heads, raters and class of mitigation; numbers are traced.
+It is compiled once per combination of array sizes, heads, raters and class of mitigation; numbers are traced.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -22,11 +18,11 @@ from uard.agents.tabular import QLearning
 from uard.envs.tabular import MIN_STATES, HiddenTruth, Ratings, Task, at, pad, step
 from uard.feedback import running
 from uard.mitigation import Evidence, Feedback, Mitigation
+from uard.training import lanes
 from uard.training.tracing import traceable
-from uard.training.xla import TABULAR_OPTIONS
 
 CHUNK = 512  # steps whose random numbers are drawn together; what is usual is measured once a chunk
-ROOM = 64  # a program has room for this many lanes, or a multiple: fewer are no reason to compile again
+ROOM = 64
 LOG = ("trap_visits", "true_return", "observed_return", "goal", "length", "abstained")
 
 
@@ -100,43 +96,10 @@ def lane(
 
 
 def train(
-    lanes: list[Lane], program: Program, fields: tuple[str, ...] = ("log", "steps")
+    these: list[Lane], program: Program, fields: tuple[str, ...] = ("log", "steps")
 ) -> list[dict[str, np.ndarray]]:
     """Train all lanes, which must agree in everything that is not a number, and return the asked-for fields."""
-    room = -(-len(lanes) // ROOM) * ROOM
-    filled = lanes + [lanes[-1]] * (room - len(lanes))
-    stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(x, _narrow(x)) for x in leaves]), *filled)
-    out = _train(stacked, np.int32(len(lanes)), program, fields)
-    host = {name: np.asarray(value) for name, value in out.items()}
-    return [{name: value[i] for name, value in host.items()} for i in range(len(lanes))]
-
-
-def _narrow(x: Any) -> Any:
-    dtype = np.asarray(x).dtype
-    return np.float32 if dtype == np.float64 else np.int32 if dtype == np.int64 else dtype
-
-
-def signature(one: Lane) -> str:
-    """Lanes with equal signatures can be trained by one program."""
-    leaves, tree = jax.tree.flatten(one)
-    return f"{tree} {[np.shape(x) for x in leaves]}"
-
-
-@partial(jax.jit, static_argnames=("program", "fields"), compiler_options=TABULAR_OPTIONS)
-def _train(lanes: Lane, count: Array, program: Program, fields: tuple[str, ...]) -> dict[str, Array]:
-    def pick(i: Array) -> dict[str, Array]:
-        one = jax.tree.map(lambda x: x[i], lanes)
-        outcome = run(one, program)._asdict()
-        return {name: outcome[name] for name in fields}
-
-    room = jax.tree.leaves(lanes)[0].shape[0]
-    shapes = jax.eval_shape(pick, jnp.int32(0))
-    out = jax.tree.map(lambda s: jnp.zeros((room, *s.shape), s.dtype), shapes)
-
-    def body(i: Array, acc: dict[str, Array]) -> dict[str, Array]:
-        return jax.tree.map(lambda a, x: lax.dynamic_update_index_in_dim(a, x, i, 0), acc, pick(i))
-
-    return lax.fori_loop(0, count, body, out)
+    return lanes.train(these, run, program, fields, ROOM, tables=True)
 
 
 class _Carry(NamedTuple):
@@ -157,6 +120,7 @@ def run(one: Lane, program: Program) -> Outcome:
     """Train one lane (pure; jit and vmap it at will)."""
     task, agent, mitigation = one.task, one.agent, one.mitigation
     states, actions = task.next_state.shape
+    starts = jnp.atleast_1d(jnp.asarray(task.start, jnp.int32))
     raters = one.ratings.centre.shape[-1]
     listens = mitigation.reads_feedback
     # One row per state-action, so that a step reads each table once.
@@ -197,6 +161,8 @@ def run(one: Lane, program: Program) -> Outcome:
             action = lax.optimization_barrier(action)
         old = at(c.row, action)
         _, sigma_m = tabular.mean_and_deviation(old)
+        if task.doubt is not None:
+            sigma_m = jnp.hypot(sigma_m, at(at(task.doubt, c.state), action))
         state2, reward, terminated, truncated = step(task, c.state, c.time, action)
         place = c.state * actions + action
         active = (c.episode < program.episodes).astype(jnp.float32)
@@ -242,7 +208,8 @@ def run(one: Lane, program: Program) -> Outcome:
             counted = jnp.where(jnp.arange(len(LOG)) == LOG.index("abstained"), abstained, counted)
         sums = c.sums + counted
         log = lax.dynamic_update_slice(c.log, sums[None], (jnp.minimum(c.episode, program.episodes), 0))
-        state = jnp.where(done, task.start, state2)
+        episode = c.episode + done.astype(jnp.int32)
+        state = jnp.where(done, at(starts, episode % starts.shape[0]), state2)
         return _Carry(
             q=q,
             row=at(q, state),
@@ -250,7 +217,7 @@ def run(one: Lane, program: Program) -> Outcome:
             usual=c.usual,
             state=state,
             time=jnp.where(done, 0, c.time + 1),
-            episode=c.episode + done.astype(jnp.int32),
+            episode=episode,
             epsilon=jnp.where(done, tabular.next_epsilon(agent, c.epsilon), c.epsilon),
             sums=jnp.where(done, 0.0, sums),
             log=log,
@@ -281,10 +248,10 @@ def run(one: Lane, program: Program) -> Outcome:
     feedback = running.empty(states, actions)
     start = _Carry(
         q=q,
-        row=q[task.start],
+        row=q[starts[0]],
         feedback=feedback,
         usual=usual(feedback),
-        state=jnp.asarray(task.start, jnp.int32),
+        state=starts[0],
         time=jnp.int32(0),
         episode=jnp.int32(0),
         epsilon=jnp.float32(agent.epsilon),

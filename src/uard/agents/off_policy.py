@@ -1,0 +1,85 @@
+"""What an agent that learns from a replay buffer is to a training loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+from jax import Array
+
+from uard.mitigation import Backup, LearningSignal
+
+
+class Batch(NamedTuple):
+    """Transitions drawn from the buffer.
+
+    Attributes:
+        observation: (B, features).
+        action: (B,).
+        following: (B, features), the observation after the step.
+        terminated: (B,), whether the step ended the episode; a cut-off at the horizon does not count.
+        mask: (B, N), which members learn from a transition (0 or 1).
+    """
+
+    observation: Array
+    action: Array
+    following: Array
+    terminated: Array
+    mask: Array
+
+
+class Watched(NamedTuple):
+    """What is watched for divergence after an update: the loss, and the largest absolute value it saw."""
+
+    loss: Array
+    largest: Array
+
+
+# Of the ensemble's disagreement about the batch's state-actions (B,), the reward to learn from and its weight.
+Judge = Callable[[Array], LearningSignal]
+# Of mean values (B, A), their deviations (B, A) and the observations (B, features), the mitigation's scores (B, A).
+Prefer = Callable[[Array, Array, Array], Array]
+
+
+@runtime_checkable
+class OffPolicy(Protocol):
+    """A learner from a replay buffer; its methods are pure.
+
+    Attributes:
+        buffer: Transitions kept.
+        batch: Transitions per update.
+        warmup: Steps before the first update.
+        bootstrap: Chance that a member learns from a transition.
+    """
+
+    buffer: int
+    batch: int
+    warmup: int
+    bootstrap: float
+
+    @property
+    def members(self) -> int:
+        """Number of members of the ensemble."""
+        ...
+
+    def init(self, key: Array, features: int, actions: int) -> Any:
+        """Return a fresh state: any pytree."""
+        ...
+
+    def read(self, state: Any, observations: Array, key: Array) -> tuple[Array, Array]:
+        """Return mu and sigma_m, (B, A) each, of observations (B, features)."""
+        ...
+
+    def act(self, state: Any, observation: Array, prefer: Prefer, episode: Array, key: Array) -> Array:
+        """Return an exploring action for one observation (features,) in the given episode (0-based)."""
+        ...
+
+    def greedy(self, state: Any, observation: Array, prefer: Prefer, key: Array) -> Array:
+        """Return the action without exploration."""
+        ...
+
+    def update(
+        self, state: Any, batch: Batch, judge: Judge, prefer: Prefer, backup: Backup, key: Array
+    ) -> tuple[Any, Watched]:
+        """Learn from one batch."""
+        ...

@@ -1,0 +1,168 @@
+"""Training of agents that learn from a replay buffer, as one compiled program."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from uard.agents.off_policy import Batch, OffPolicy
+from uard.mitigation import Evidence
+from uard.training import deep
+from uard.training.deep import LOG, Ears, Lane, Outcome, Program
+
+CHUNK = 128  # steps between fits of the rating model; what is usual is measured then
+
+
+class _Carry(NamedTuple):
+    agent: Any
+    buffer: Any
+    known: Any
+    model: Any
+    usual: Any
+    state: Any
+    time: Array
+    episode: Array
+    sums: Array
+    log: Array
+    steps: Array
+    loss: Array
+    largest: Array
+
+
+class _Row(NamedTuple):
+    """One transition, as kept: compact states, from which observations are made when it is drawn."""
+
+    state: Any
+    action: Array
+    reward: Array
+    doubt: Array
+    following: Any
+    terminated: Array
+    mask: Array
+
+
+def run(one: Lane, program: Program) -> Outcome:
+    """Train one lane (pure; jit and vmap it at will)."""
+    world, agent, mitigation = one.world, one.agent, one.mitigation
+    assert isinstance(agent, OffPolicy)
+    ears = Ears(one, program)
+    observe = jax.vmap(world.observe)
+    limit = program.steps
+
+    def prefer_in(c: _Carry, states: Any) -> Any:
+        def prefer(mu: Array, sigma: Array, observations: Array) -> Array:
+            return mitigation.score(mu, sigma, ears.of_all(c.known, c.model, states), c.usual)
+
+        return prefer
+
+    def one_step(c: _Carry, keys: Any) -> tuple[_Carry, None]:
+        own, of_world, of_panel = keys
+        act_key, mask_key, draw_key, learn_key = jax.random.split(own, 4)
+        alone = jax.tree.map(lambda x: x[None], c.state)
+        observation = world.observe(c.state)
+        action = agent.act(c.agent, observation, prefer_in(c, alone), c.episode, act_key)
+        step_key, reset_key = jax.random.split(of_world)
+        after = world.step(c.state, action, step_key)
+        verdict = world.judge(c.state, action, after)
+        known = ears.hear(c.known, c.state, action, after, of_panel)
+
+        # Added before it is drawn from: the other way round XLA would copy the buffer at every step.
+        mask = (jax.random.uniform(mask_key, (agent.members,)) < agent.bootstrap).astype(jnp.float32)
+        row = _Row(c.state, action, after.reward, after.doubt, after.state, after.terminated, mask)
+        place = c.steps % agent.buffer
+        buffer = jax.tree.map(lambda kept, new: kept.at[place].set(new), c.buffer, row)
+        filled = jnp.minimum(c.steps + 1, agent.buffer)
+        drawn: _Row = jax.tree.map(lambda x: x[jax.random.randint(draw_key, (agent.batch,), 0, filled)], buffer)
+
+        feedback = ears.of(known, c.model, drawn.state, drawn.action)
+
+        def judge(sigma_m: Array) -> Any:
+            return mitigation.signal(Evidence(drawn.reward, jnp.hypot(sigma_m, drawn.doubt), feedback), c.usual)
+
+        batch = Batch(observe(drawn.state), drawn.action, observe(drawn.following), drawn.terminated, drawn.mask)
+        prefer = prefer_in(c._replace(known=known), drawn.following)
+        learned, watched = agent.update(c.agent, batch, judge, prefer, mitigation.backup, learn_key)
+        ready = c.steps + 1 >= agent.warmup
+        learner = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, c.agent)
+
+        truncated = (c.time + 1 >= world.horizon) & ~after.terminated
+        done = after.terminated | truncated
+        counted = [verdict.hack, verdict.reward, after.reward, verdict.goal, 1.0, 0.0]
+        sums = c.sums + jnp.stack([jnp.asarray(x, jnp.float32) for x in counted])
+        log = c.log.at[jnp.minimum(c.episode, program.episodes)].set(sums)
+        fresh = world.reset(reset_key)
+        state = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after.state)
+        return _Carry(
+            agent=learner,
+            buffer=buffer,
+            known=known,
+            model=c.model,
+            usual=c.usual,
+            state=state,
+            time=jnp.where(done, 0, c.time + 1),
+            episode=c.episode + done.astype(jnp.int32),
+            sums=jnp.where(done, 0.0, sums),
+            log=log,
+            steps=c.steps + 1,
+            loss=jnp.where(ready, c.loss + watched.loss, c.loss),
+            largest=jnp.where(ready, jnp.maximum(c.largest, watched.largest), c.largest),
+        ), None
+
+    def chunk(loop: tuple[_Carry, Array, deep.Watch]) -> tuple[_Carry, Array, deep.Watch]:
+        c, number, watch = loop
+        streams = (deep.OWN, deep.WORLD, deep.PANEL)
+        keys = [jax.random.split(jax.random.fold_in(deep.key_of(one.seed, s), number), CHUNK) for s in streams]
+        c, _ = lax.scan(one_step, c, tuple(keys))
+        model = ears.study(c.known, c.model, jax.random.fold_in(deep.key_of(one.seed, deep.MODEL), number))
+        c = c._replace(model=model, usual=ears.usual(c.known, model))
+        watch = watch.after(c.steps, c.agent, c.loss, c.largest, model, c.sums, agent.network.value_scale)
+        return c._replace(loss=jnp.float32(0.0), largest=jnp.float32(0.0)), number + 1, watch
+
+    known, model = ears.init()
+    first = world.reset(jax.random.fold_in(deep.key_of(one.seed, deep.WORLD), deep.FIRST))
+    learner = agent.init(deep.key_of(one.seed, deep.INIT), world.features, world.actions)
+    row = _Row(
+        first,
+        jnp.int32(0),
+        jnp.float32(0.0),
+        jnp.float32(0.0),
+        first,
+        jnp.asarray(False),
+        jnp.zeros(agent.members, jnp.float32),
+    )
+    start = _Carry(
+        agent=learner,
+        buffer=jax.tree.map(lambda x: jnp.zeros((agent.buffer, *jnp.shape(x)), jnp.asarray(x).dtype), row),
+        known=known,
+        model=model,
+        usual=ears.usual(known, model),
+        state=first,
+        time=jnp.int32(0),
+        episode=jnp.int32(0),
+        sums=jnp.zeros(len(LOG), jnp.float32),
+        log=jnp.zeros((program.episodes + 1, len(LOG)), jnp.float32),
+        steps=jnp.int32(0),
+        loss=jnp.float32(0.0),
+        largest=jnp.float32(0.0),
+    )
+
+    def unfinished(loop: tuple[_Carry, Array, deep.Watch]) -> Array:
+        c, _, watch = loop
+        going = c.episode < program.episodes
+        if limit is not None:
+            going &= c.steps < limit
+        return going & (watch.fault == 0)
+
+    c, _, watch = lax.while_loop(unfinished, chunk, (start, jnp.uint32(0), deep.Watch.start(learner)))
+
+    def greedy(state: Any, key: Array) -> Array:
+        alone = jax.tree.map(lambda x: x[None], state)
+        return agent.greedy(c.agent, world.observe(state), prefer_in(c, alone), key)
+
+    def read(states: Any) -> tuple[Array, Array]:
+        return agent.read(c.agent, observe(states), deep.key_of(one.seed, deep.INIT))
+
+    return deep.outcome(one, program, ears, c, watch, greedy, read)
