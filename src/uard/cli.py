@@ -69,7 +69,7 @@ class Reproduce:
     """Run the paper's grid studies and ours, and write the report. Finished cells are never run again."""
 
     studies: Positional[tuple[str, ...]] = ()
-    """Which studies (see `uard list`); all of the grid if left out."""
+    """Which studies or groups of them (see `uard list`): grid if left out, grid-deep, games."""
     seeds: int = 10
     """Number of seeds (0, 1, ...)."""
     report: str | None = None
@@ -277,7 +277,7 @@ def _reproduce(command: Reproduce, console: Console) -> None:
     _checks.whole("seeds", command.seeds, low=2, high=100_000)
     _check_workers(command.workers)
     chosen = studies.find(command.studies)
-    if command.report and len(chosen) < len(studies.grid()):
+    if command.report and {s.name for s in chosen} < {s.name for s in studies.grid()}:
         raise _invalid("report", command.report, "left out unless all grid studies are run")
     if command.report:
         _check_writable("report", command.report, Path(command.report))
@@ -336,13 +336,14 @@ def _list(command: List, console: Console) -> None:
 
     out = Console()
     rows: dict[str, dict[str, str]] = {
-        "environments": {
-            k: f"{v.size}x{v.size}, T={v.horizon}, trap {v.trap_reward:+g}" for k, v in names.ENVIRONMENTS.items()
-        },
-        "agents": {k: f"{v.heads} heads, epsilon from {v.epsilon:g}" for k, v in names.AGENTS.items()},
+        "environments": {k: str(v) for k, v in names.ENVIRONMENTS.items()},
+        "agents": {k: str(v) for k, v in names.AGENTS.items()},
         "mitigations": {k: str(mitigation.named(k)) for k in mitigation.NAMED},
         "panels": {k: (v.__doc__ or "").split("\n")[0] for k, v in PANELS.items()},
-        "studies": {s.name: f"{s.title} ({s.answers}; {len(s.rows)} cells)" for s in studies.grid()},
+        **{
+            f"studies of {group}": {s.name: f"{s.title} ({s.answers}; {len(s.rows)} cells)" for s in members}
+            for group, members in studies.groups().items()
+        },
     }
     for title, entries in rows.items():
         table = Table("name", "", title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))

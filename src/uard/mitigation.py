@@ -224,8 +224,8 @@ class RewardDiscounting(Mitigation):
         kappa: Gain of the adaptive lambda_t (A44) >= 0; 0 keeps lambda constant.
         proxy_is_rater: Count the observed reward as one more rater in sigma_h.
         standardise: Measure sigmas in units of the running scale of the observed reward.
-        unrated_weight: How far a reward is believed that nobody has rated yet, in [0, 1].
-        prior_count: Pseudo-count >= 0 with which anchor and weight of few ratings are drawn towards those of an
+        unrated_weight: How far a reward is believed that nobody has rated yet, in [0, 1], on top of the ensemble's doubt.
+        prior_count: Pseudo-count >= 0 with which anchor and trust of few ratings are drawn towards those of an
             unrated step (the usual lowest rating, ``unrated_weight``).
         backup: See ``Mitigation``.
     """
@@ -265,7 +265,9 @@ class RewardDiscounting(Mitigation):
         weight = self.filter.weight(
             sigma_m / unit, sigma_h / unit, mu=(mu if self.anchor == "zero" else abs(mu)) / unit, lam=lam
         )
-        return uncertainty.shrink(weight, feedback.count, self.unrated_weight, self.prior_count)
+        # A factor, not a mixture: where nobody has rated, the ensemble's doubt still counts.
+        one = namespace(weight).ones_like(weight)
+        return weight * uncertainty.shrink(one, feedback.count, self.unrated_weight, self.prior_count)
 
     def signal(self, evidence: Evidence, usual: Usual) -> LearningSignal:
         """Return b + w (r - b), or the observed reward if only scores are discounted."""

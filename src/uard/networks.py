@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jax import Array
 
 from uard import _checks, uncertainty
@@ -90,11 +91,13 @@ PRIOR_WIDTH = 16  # a prior need not be learned, so it may be small
 def layer(key: Array, inputs: int, outputs: int, members: int | None = None, gain: float = 2.0**0.5) -> Layer:
     """Draw a layer with orthogonal weights and no bias, as is usual in deep RL."""
     shape = (inputs, outputs) if members is None else (members, inputs, outputs)
+    # One member after the other: LAPACK waits for a batch inside the pool of threads that has to work on it, so two
+    # batches at once have waited for each other for ever on two cores.
     normal = jax.nn.initializers.orthogonal(gain)
     weight = (
         normal(key, shape, jnp.float32)
         if members is None
-        else jax.vmap(lambda k: normal(k, (inputs, outputs), jnp.float32))(jax.random.split(key, members))
+        else jax.lax.map(lambda k: normal(k, (inputs, outputs), jnp.float32), jax.random.split(key, members))
     )
     return Layer(weight, jnp.zeros((*shape[:-2], outputs), jnp.float32))
 
@@ -183,6 +186,14 @@ def mean_and_deviation(all_values: Array) -> tuple[Array, Array]:
     if all_values.shape[0] == 1:
         return all_values[0], jnp.zeros_like(all_values[0])
     return all_values.mean(0), uncertainty.sigma_model(all_values, axis=0)
+
+
+def descend(learning_rate: Array | float, gradient: Any, moments: Any, weights: Any) -> tuple[Any, Any]:
+    """Take one step of Adam: return the weights and the moments after it."""
+    # Optax raises a float to an integer, which JAX forbids where all promotions have to be written out.
+    with jax.numpy_dtype_promotion("standard"):
+        step, moments = optax.adam(learning_rate).update(gradient, moments)
+        return optax.apply_updates(weights, step), moments
 
 
 def size(tree: Any) -> int:

@@ -55,12 +55,12 @@ def scored(mitigation, mu=MU, sigma_m=SIGMA_M, table=TABLE):
         (RatedReward(unrated_weight=0.25), 0.0, -0.5 + 0.25 * 4.5),
         (named("uard-operator"), 3.0, 4 / (1 + 2 * 0.5 * (0.4 + SIGMA_H))),
         (named("uard-operator", alpha=0.0), 3.0, 4 / (1 + SIGMA_H)),
-        (named("uard-operator"), 0.0, 4.0),
+        (named("uard-operator"), 0.0, 4 / (1 + 0.4)),  # unrated: sigma_m still counts
         (named("uard-operator", proxy_is_rater=True), 3.0, 4 / (1 + 0.4 + WITH_PROXY)),
         (named("uard-operator", standardise=True), 3.0, 4 / (1 + (0.4 + SIGMA_H) / 2)),
         (named("uard-operator", kappa=1.0), 3.0, 4 / (1 + ((SIGMA_H - 0.5) / 0.25) * (0.4 + SIGMA_H))),
         (named("uard-operator", anchor="lowest"), 3.0, -1 + 5 / (1 + 0.4 + SIGMA_H)),
-        (named("uard-operator", anchor="lowest", prior_count=1.0), 0.0, 4.0),
+        (named("uard-operator", anchor="lowest", prior_count=1.0), 0.0, -0.5 + 4.5 / (1 + 0.4)),
         (named("uard-operator", anchor="lowest", prior_count=1.0, unrated_weight=0.0), 0.0, -0.5),
         (named("uard-paper"), 3.0, 4.0),
     ],
@@ -74,11 +74,11 @@ def test_reward_by_hand(mitigation, count, expected):
 def test_recommended_form_by_hand():
     z = (WITH_PROXY - 0.5) / 0.25
     lam = 0.2 * (1 + 20.0 * (z - 1))
-    w = (3 / (1 + lam * 0.5 * (0.4 + WITH_PROXY) / 2) + 0.1) / 4
+    w = (3 + 0.1) / 4 / (1 + lam * 0.5 * (0.4 + WITH_PROXY) / 2)
     anchor = (3 * -1.0 - 0.5) / 4
     signal = named("uard", kappa=20.0, unrated_weight=0.1, prior_count=1.0).signal(evidence(), USUAL)
     assert float(signal.reward[0]) == pytest.approx(anchor + w * (4 - anchor), abs=1e-12)
-    assert float(signal.reward[0]) == pytest.approx(-0.4011, abs=1e-4)
+    assert float(signal.reward[0]) == pytest.approx(-0.5112, abs=1e-4)
 
 
 def test_recommended_form_believes_a_bonus_that_all_raters_confirm():
@@ -95,19 +95,23 @@ def test_screening_leaves_out_contested_steps(limit, count, weight):
 
 
 @pytest.mark.parametrize(
-    ("changes", "expected"),
+    ("changes", "expected", "unrated"),
     [
-        ({}, MU / (1 + 2 * 0.5 * (SIGMA_M + TABLE.spread))),
-        ({"anchor": "lowest"}, -1 + (MU + 1) / (1 + 2 * 0.5 * (SIGMA_M + TABLE.spread))),
-        ({"lam": 0.0}, MU),
-        ({"acts_on": "reward"}, MU),
+        ({}, MU / (1 + 2 * 0.5 * (SIGMA_M + TABLE.spread)), MU / (1 + SIGMA_M)),
+        (
+            {"anchor": "lowest"},
+            -1 + (MU + 1) / (1 + 2 * 0.5 * (SIGMA_M + TABLE.spread)),
+            -1 + (MU + 1) / (1 + SIGMA_M),
+        ),
+        ({"lam": 0.0}, MU, MU),
+        ({"acts_on": "reward"}, MU, MU),
     ],
 )
-def test_score_by_hand(changes, expected):
+def test_score_by_hand(changes, expected, unrated):
     rated = TABLE._replace(count=np.ones(4))
     np.testing.assert_allclose(scored(named("uard-paper", **changes), table=rated), expected)
-    unrated = TABLE._replace(count=np.zeros(4))
-    np.testing.assert_allclose(scored(named("uard-paper", **changes), table=unrated), MU)
+    silent = TABLE._replace(count=np.zeros(4))
+    np.testing.assert_allclose(scored(named("uard-paper", **changes), table=silent), unrated)
 
 
 def test_usual_is_over_what_was_rated():

@@ -66,6 +66,10 @@ class OffPolicy(Protocol):
         """Return a fresh state: any pytree."""
         ...
 
+    def values(self, state: Any, observations: Array, key: Array) -> Array:
+        """Return all members' values, (N, B, A), of observations (B, features)."""
+        ...
+
     def read(self, state: Any, observations: Array, key: Array) -> tuple[Array, Array]:
         """Return mu and sigma_m, (B, A) each, of observations (B, features)."""
         ...
@@ -79,7 +83,14 @@ class OffPolicy(Protocol):
         ...
 
     def update(
-        self, state: Any, batch: Batch, judge: Judge, prefer: Prefer, backup: Backup, key: Array
+        self,
+        state: Any,
+        batch: Batch,
+        judge: Judge,
+        prefer: Prefer,
+        prefer_here: Prefer,
+        backup: Backup,
+        key: Array,
     ) -> tuple[Any, Watched]:
-        """Learn from one batch."""
+        """Learn from one batch; ``prefer`` scores the observations after its steps, ``prefer_here`` those before."""
         ...

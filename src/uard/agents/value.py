@@ -19,11 +19,10 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-
 from uard import _checks, networks
-from uard.networks import SINGLE, Ensemble, Network, Weights
 from uard.agents.off_policy import Batch, Judge, Prefer, Watched
 from uard.mitigation import Backup
+from uard.networks import SINGLE, Ensemble, Network, Weights
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ class DeepQ:
         explore, choice, dropout = jax.random.split(key, 3)
         mu, sigma = self.read(state, observation[None], dropout)
         scores = prefer(mu, sigma, observation[None]) + self.ucb * sigma
-        rate = jnp.maximum(self.epsilon * self.epsilon_decay**episode, self.epsilon_min)
+        rate = jnp.maximum(self.epsilon * self.epsilon_decay ** episode.astype(jnp.float32), self.epsilon_min)
         chance = jax.random.randint(choice, (), 0, mu.shape[-1])
         return jnp.where(jax.random.uniform(explore) < rate, chance, jnp.argmax(scores[0])).astype(jnp.int32)
 
@@ -112,7 +111,14 @@ class DeepQ:
         return jnp.argmax(prefer(mu, sigma, observation[None])[0]).astype(jnp.int32)
 
     def update(
-        self, state: State, batch: Batch, judge: Judge, prefer: Prefer, backup: Backup, key: Array
+        self,
+        state: State,
+        batch: Batch,
+        judge: Judge,
+        prefer: Prefer,
+        prefer_here: Prefer,
+        backup: Backup,
+        key: Array,
     ) -> tuple[State, Watched]:
         """Take one step of Adam on the temporal difference (and CQL's gap)."""
         drop, drop_next, drop_read = jax.random.split(key, 3)
@@ -148,8 +154,8 @@ class DeepQ:
             return (mask * signal.sample_weight * each).mean(), jnp.max(jnp.abs(taken))
 
         (lost, largest), gradient = jax.value_and_grad(loss, has_aux=True)(state.weights.layers)
-        step, optimiser = optax.adam(self.network.learning_rate).update(gradient, state.optimiser)
-        layers = optax.apply_updates(state.weights.layers, step)
+        rate = self.network.learning_rate
+        layers, optimiser = networks.descend(rate, gradient, state.optimiser, state.weights.layers)
         count = state.updates + 1
         fresh = count % self.target_every == 0
         target = jax.tree.map(lambda new, old: jnp.where(fresh, new, old), layers, state.target)

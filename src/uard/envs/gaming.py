@@ -18,7 +18,7 @@ import numpy as np
 
 from uard import _checks
 from uard.envs import panels
-from uard.envs.tabular import HiddenTruth, Task
+from uard.envs.tabular import HiddenTruth, Ratings, Task
 from uard.envs.trapgrid import MOVES
 
 if TYPE_CHECKING:
@@ -175,6 +175,10 @@ class BoatRace:
         """Return the compiled world, each step rated by a panel (needs JAX)."""
         return panels.of_tables(self, panel, noise)
 
+    def speech(self, panel: str, noise: float) -> Ratings:
+        """Return what the panel says of every step."""
+        return panels.ratings(panel, self.task(), self.truth(), noise)
+
 
 @dataclass(frozen=True)
 class TomatoWatering:
@@ -302,3 +306,7 @@ class AbsentSupervisor:
     def world(self, panel: str = "main", noise: float = 0.0) -> TableWorld:
         """Return the compiled world, each step rated by a panel (needs JAX)."""
         return panels.of_tables(self, panel, noise)
+
+    def speech(self, panel: str, noise: float) -> Ratings:
+        """Return what the panel says of every step."""
+        return panels.ratings(panel, self.task(), self.truth(), noise)

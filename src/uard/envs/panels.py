@@ -9,7 +9,7 @@ every rater. It reads the truth, as people do; the learner gets nothing but the 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,22 +18,11 @@ from uard.envs.tabular import HiddenTruth, Ratings, Task
 from uard.reliability import namespace
 
 if TYPE_CHECKING:
+    from uard.envs.spec import Tables
     from uard.envs.world import TableWorld
 
 Array = Any
 Speech = tuple[Array, Array]
-
-
-class Tables(Protocol):
-    """The spec of a problem small enough to be given as tables."""
-
-    def task(self) -> Task:
-        """Return what an agent meets."""
-        ...
-
-    def truth(self) -> HiddenTruth:
-        """Return what only the evaluation may see."""
-        ...
 
 
 def main(proxy: Array, true: Array, contested: Array) -> Speech:
@@ -121,5 +110,4 @@ def of_tables(spec: Tables, panel: str, noise: float) -> TableWorld:
     """Return the compiled world of a small problem, rated by a panel (needs JAX)."""
     from uard.envs.world import table_world
 
-    task, truth = spec.task(), spec.truth()
-    return table_world(task, truth, ratings(panel, task, truth, noise))
+    return table_world(spec.task(), spec.truth(), spec.speech(panel, noise))

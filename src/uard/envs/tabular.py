@@ -44,10 +44,14 @@ class HiddenTruth(NamedTuple):
 
 
 class Ratings(NamedTuple):
-    """What annotators say of a step: rating k is normal with (S, A, K) ``centre`` and ``deviation``."""
+    """What annotators say of a step: rating k is normal with (S, A, K) ``centre`` and ``deviation``.
+
+    ``reach`` is (S, A): 1 where they can rate, 0 where nobody ever does; None if they reach every step.
+    """
 
     centre: Array
     deviation: Array
+    reach: Array | None = None
 
 
 def at(table: Array, index: Array) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 
 from uard import _checks
 from uard.envs import panels
-from uard.envs.tabular import HiddenTruth, Task
+from uard.envs.tabular import HiddenTruth, Ratings, Task
 
 if TYPE_CHECKING:
     from uard.envs.world import TableWorld
@@ -127,6 +127,10 @@ class TrapGrid:
     def world(self, panel: str = "main", noise: float = 0.0) -> TableWorld:
         """Return the compiled world, each step rated by a panel (needs JAX)."""
         return panels.of_tables(self, panel, noise)
+
+    def speech(self, panel: str, noise: float) -> Ratings:
+        """Return what the panel says of every step."""
+        return panels.ratings(panel, self.task(), self.truth(), noise)
 
 
 def paper_grid(size: int, trap_reward: float = 4.0, **changes: object) -> TrapGrid:

@@ -176,7 +176,7 @@ class TableWorld:
 
     def rate(self, state: Array, action: Array, after: Step) -> Ratings:
         """Look the panel's speech up."""
-        return Ratings(self.said.centre[state, action], self.said.deviation[state, action])
+        return Ratings(*(None if table is None else table[state, action] for table in self.said))
 
 
 def table_world(task: Task, truth: HiddenTruth, said: Ratings, states: int = MIN_STATES) -> TableWorld:

@@ -17,9 +17,9 @@ import optax
 from jax import Array, lax
 
 from uard import _checks
-from uard.networks import Layer, mlp, through
 from uard.feedback import running
 from uard.mitigation import Feedback
+from uard.networks import Layer, descend, mlp, through
 
 OUTPUTS = 4  # mean, lowest, spread, proxy: the columns of a row after its count
 
@@ -164,8 +164,7 @@ def fit(spec: RatingModel, model: Model, known: Memory, observe: Any, actions: i
             return optax.losses.huber_loss(taken, target[None]).sum(-1).mean(-1).sum()
 
         gradient = jax.grad(loss)(layers)
-        step, moved = optax.adam(spec.learning_rate).update(gradient, optimiser)
-        after = optax.apply_updates(layers, step), moved
+        after = descend(spec.learning_rate, gradient, optimiser, layers)
         return jax.tree.map(lambda new, old: jnp.where(some, new, old), after, carry), None
 
     (layers, optimiser), _ = lax.scan(one, (model.layers, model.optimiser), jax.random.split(key, spec.fits))

@@ -14,11 +14,14 @@ import numpy as np
 from uard import _checks
 from uard.agents.tabular import QLearning
 from uard.envs.panels import PANELS
+from uard.envs.spec import Spec
 from uard.envs.trapgrid import TrapGrid
+from uard.feedback.learned import RatingModel
+from uard.lab import names
 from uard.mitigation import Mitigation, Raw
 
 # Raise this when training code changes what a cell means: old results are then not found, never mixed in.
-RESULTS = 1
+RESULTS = 2
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Cell:
     """One environment, panel, agent and mitigation, trained for some episodes.
 
     Attributes:
-        environment: The grid.
+        environment: Where it learns.
         mitigation: What the agent does about a reward that may lie.
         agent: The learner.
         panel: Who rates. Irrelevant, and therefore ignored, for a mitigation that reads no ratings.
@@ -34,42 +37,63 @@ class Cell:
         rated: Fraction of steps that are rated, in [0, 1].
         episodes: Training episodes, >= 1.
         ddof: Of the annotators' deviation.
-        snapshots: Tables kept along the way, for the uncertainty curves.
+        snapshots: Tables kept along the way, for the uncertainty curves; tabular agents only.
+        feedback: How a deep agent knows of ratings: a model of them, or running means per state-action if None (which a
+            tabular agent always has).
     """
 
-    environment: TrapGrid = field(default_factory=TrapGrid)
+    environment: Spec = field(default_factory=TrapGrid)
     mitigation: Mitigation = field(default_factory=Raw)
-    agent: QLearning = field(default_factory=QLearning)
+    agent: Any = field(default_factory=QLearning)
     panel: str = "main"
     noise: float = 0.0
     rated: float = 1.0
     episodes: int = 500
     ddof: int = 0
     snapshots: int = 0
+    feedback: RatingModel | None = None
 
     def __post_init__(self) -> None:
-        """Check everything; forget what cannot matter."""
+        """Check everything; forget what cannot matter.
+
+        Raises:
+            InvalidValueError: a field out of range, or an agent that cannot work in the environment, with those that can.
+        """
         _checks.choose("panel", self.panel, PANELS)
         _checks.number("noise", self.noise, low=0)
         _checks.number("rated", self.rated, low=0, high=1)
         _checks.whole("episodes", self.episodes, low=1, high=1_000_000)
         _checks.whole("ddof", self.ddof, low=0, high=1)
         _checks.whole("snapshots", self.snapshots, low=0, high=1000)
-        for name, kind in (("environment", TrapGrid), ("mitigation", Mitigation), ("agent", QLearning)):
+        for name, kind in (("environment", Spec), ("mitigation", Mitigation), ("agent", names.Agent)):
             value = getattr(self, name)
             if not isinstance(value, kind) or not _is_frozen(value):
-                allowed = f"a frozen dataclass that is a {kind.__name__}"
-                raise _checks.InvalidValueError(name, value, allowed)
+                raise _checks.InvalidValueError(name, value, f"a frozen dataclass that is {_an(kind)}")
             object.__setattr__(self, name, _settled(name, value))
+        names.check_pair(self.agent, self.environment)
+        if isinstance(self.agent, QLearning):
+            if self.feedback is not None:
+                raise _checks.InvalidValueError(
+                    "feedback", self.feedback, "none for a tabular agent, which keeps tables"
+                )
+        elif self.snapshots:
+            raise _checks.InvalidValueError("snapshots", self.snapshots, "0 for an agent that keeps no tables")
+        if self.feedback is not None:
+            if not isinstance(self.feedback, RatingModel):
+                raise _checks.InvalidValueError("feedback", self.feedback, "a RatingModel or none")
+            object.__setattr__(self, "feedback", _settled("feedback", self.feedback))
         if not self.mitigation.reads_feedback:
-            for name, value in (("panel", "main"), ("noise", 0.0), ("rated", 1.0)):
+            for name, value in (("panel", "main"), ("noise", 0.0), ("rated", 1.0), ("feedback", None)):
                 object.__setattr__(self, name, value)
         for name, kind in (("noise", float), ("rated", float), ("episodes", int), ("ddof", int), ("snapshots", int)):
             object.__setattr__(self, name, kind(getattr(self, name)))
 
     def config(self) -> dict[str, Any]:
-        """Return the whole configuration as plain data."""
-        return plain(self)
+        """Return the whole configuration as plain data; without ``feedback`` where it is none, as before it was added."""
+        config = plain(self)
+        if self.feedback is None:
+            del config["feedback"]
+        return config
 
     @cached_property
     def key(self) -> str:
@@ -80,6 +104,11 @@ class Cell:
     def with_(self, **changes: Any) -> Cell:
         """Return a copy with some fields changed."""
         return replace(self, **changes)
+
+
+def _an(kind: Any) -> str:
+    kinds = getattr(kind, "__args__", (kind,))
+    return "a " + " or a ".join(k.__name__ for k in kinds)
 
 
 def _is_frozen(value: Any) -> bool:

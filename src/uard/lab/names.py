@@ -8,19 +8,81 @@ from typing import Any
 
 from uard import _checks, mitigation
 from uard.abstention import Abstention
+from uard.agents.actor_critic import SoftActorCritic, edac
+from uard.agents.off_policy import OffPolicy
+from uard.agents.policy import CPO, PPO, TRPO, PolicyGradient
 from uard.agents.tabular import QLearning
+from uard.agents.value import DeepQ
+from uard.envs.classic import Acrobot, CartPole
+from uard.envs.gaming import AbsentSupervisor, BoatRace, TomatoWatering
 from uard.envs.panels import PANELS
+from uard.envs.spec import Spec, Tables
 from uard.envs.trapgrid import TrapGrid
 from uard.mitigation import Mitigation
+from uard.networks import Ensemble, Network
 
-ENVIRONMENTS: dict[str, TrapGrid] = {
+ENVIRONMENTS: dict[str, Spec] = {
     "TrapGrid": TrapGrid(),
     **{f"TrapGrid{n}": TrapGrid(size=n) for n in (6, 8, 10)},
     **{f"TrapGrid{n}-Trap8": TrapGrid(size=n, trap_reward=8.0) for n in (6, 8, 10)},
     **{f"TrapGrid{n}-Legitimate": TrapGrid(size=n, legitimate=True) for n in (6, 8, 10)},
     "TrapGrid10-T100": TrapGrid(size=10, horizon=100),
+    **{
+        f"{spec.__name__}{suffix}": spec(legitimate=bool(suffix))
+        for spec in (BoatRace, TomatoWatering, AbsentSupervisor)
+        for suffix in ("", "-Legitimate")
+    },
+    "CartPole": CartPole(),
+    "Acrobot": Acrobot(),
 }
-AGENTS: dict[str, QLearning] = {"q-learning": QLearning(), "random-walk": QLearning(1, 0.1, 0.95, 1.0, 1.0, 1.0)}
+
+
+def deep_agents(network: Network | None = None) -> dict[str, Any]:
+    """Return the paper's deep baselines (D4-D12) by name, with one network for all of them (J35).
+
+    Ensemble members where the paper has them; others have what the algorithm itself needs.
+    """
+    net = network or Network()
+    five = Ensemble("shared", 5)
+    return {
+        "dqn": DeepQ(net),
+        "ensemble-dqn": DeepQ(net, five),
+        "cql": DeepQ(net, conservative=1.0),
+        "sunrise": DeepQ(net, five, ucb=1.0, temperature=10.0),
+        "ppo": PPO(net),
+        "trpo": TRPO(net),
+        "cpo": CPO(net, oracle=False),
+        "cpo-oracle": CPO(net),
+        "sac": SoftActorCritic(net),
+        "edac": edac(network=net),
+    }
+
+
+Agent = QLearning | OffPolicy | PolicyGradient
+AGENTS: dict[str, Agent] = {
+    "q-learning": QLearning(),
+    "random-walk": QLearning(1, 0.1, 0.95, 1.0, 1.0, 1.0),
+    **deep_agents(),
+}
+
+
+def can_work(agent: Any, environment: Any) -> bool:
+    """Whether an agent can work in an environment: one with tables needs an environment that fits into them."""
+    return isinstance(environment, Tables) or not isinstance(agent, QLearning)
+
+
+def check_pair(agent: Any, environment: Any) -> None:
+    """Refuse an agent that cannot work in an environment.
+
+    Raises:
+        InvalidValueError: with the names of those that can.
+    """
+    if not can_work(agent, environment):
+        able = ", ".join(name for name, other in AGENTS.items() if can_work(other, environment))
+        where = type(environment).__name__
+        raise _checks.InvalidValueError(
+            "agent", agent, f"one that can work in {where}, which does not fit into tables: {able}"
+        )
 
 
 def settings(pairs: tuple[str, ...], option: str = "--set") -> dict[str, Any]:
@@ -69,10 +131,10 @@ def changed(base: Any, changes: dict[str, Any], what: str) -> Any:
     return dataclasses.replace(base, **given)
 
 
-def environment(name: str, changes: dict[str, Any]) -> TrapGrid:
+def environment(name: str, changes: dict[str, Any]) -> Spec:
     """Return an environment by name. A new size, unless more is said, brings its own traps, goal and horizon."""
     base = ENVIRONMENTS[_checks.choose("environment", name, ENVIRONMENTS)]
-    if changes.get("size", base.size) != base.size:
+    if isinstance(base, TrapGrid) and changes.get("size", base.size) != base.size:
         base = TrapGrid(trap_reward=base.trap_reward, legitimate=base.legitimate)
         base = _bare(base)
     return changed(base, changes, "environment")
@@ -87,10 +149,10 @@ def _bare(grid: TrapGrid) -> TrapGrid:
     return copy
 
 
-def agent(name: str, changes: dict[str, Any]) -> QLearning:
+def agent(name: str, changes: dict[str, Any]) -> Agent:
     """Return an agent by name, some fields changed (``abstention.rule`` and the like make it abstain)."""
     base = AGENTS[_checks.choose("agent", name, AGENTS)]
-    if any(field.partition(".")[0] == "abstention" for field in changes):
+    if isinstance(base, QLearning) and any(field.partition(".")[0] == "abstention" for field in changes):
         base = dataclasses.replace(base, abstention=Abstention())
     return changed(base, changes, "agent")
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from uard import calibration, statistics, uncertainty
 from uard.agents.tabular import QLearning
+from uard.envs.spec import Tables
 from uard.envs.tabular import HiddenTruth, Task
 from uard.lab.cell import Cell
 from uard.mitigation import Feedback, Mitigation
@@ -33,6 +34,24 @@ METRICS = (
 
 class CorruptResultError(RuntimeError):
     """A stored result whose bytes are not what was written."""
+
+
+class DivergedError(FloatingPointError):
+    """A run whose loss, values or parameters left the finite numbers; it is in no table.
+
+    Attributes:
+        name: Of its checkpoint.
+        good: The agent's arrays when all was well last, by their place in its state.
+    """
+
+    def __init__(self, message: str, name: str = "", good: dict[str, np.ndarray] | None = None):
+        """Say which quantity diverged, and at which step."""
+        super().__init__(message)
+        self.name, self.good = name, good or {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel between processes whole."""
+        return type(self), (str(self), self.name, self.good)
 
 
 def digest(data: bytes) -> str:
@@ -117,7 +136,7 @@ def greedy_path(task: Task, agent: QLearning, mitigation: Mitigation, q: np.ndar
     mu = q.mean(-1)
     sigma = q.std(-1, ddof=1) if agent.heads > 1 else np.zeros_like(mu)
     policy = np.asarray(mitigation.score(mu, sigma, feedback, usual)).argmax(-1)
-    path = [int(task.start)]
+    path = [int(np.atleast_1d(task.start)[0])]
     for _ in range(int(task.horizon)):
         place = path[-1], policy[path[-1]]
         path.append(int(task.next_state[place]))
@@ -130,7 +149,7 @@ def finish(cell: Cell, task: Task, truth: HiddenTruth, raters: int, out: dict[st
     """Turn a trained lane into a result: greedy path, calibration, curves of both uncertainties."""
     states = task.next_state.shape[0]
     if not (np.isfinite(out["log"]).all() and np.isfinite(out["q"]).all()):
-        raise FloatingPointError(f"training diverged: NaN or infinity in the values or the log of {cell}")
+        raise DivergedError(f"training diverged: NaN or infinity in the values or the log of {cell}", cell.key)
     feedback = read_feedback(out["feedback"][:states], raters)
     extra: dict[str, np.ndarray] = {}
     if cell.mitigation.reads_feedback:
@@ -169,3 +188,86 @@ def _uncertainty_curves(out: dict[str, Any], truth: HiddenTruth, states: int, ra
                 row.append(sigma[where].mean() if where.any() else 0.0)
         rows.append(row)
     return np.array(rows, np.float32)
+
+
+def finish_deep(cell: Cell, seed: int, out: dict[str, Any]) -> Result:
+    """Turn a trained deep lane into a result; calibration of what was learned of the raters where there are tables.
+
+    Raises:
+        DivergedError: the run diverged.
+    """
+    from uard.training.deep import QUANTITIES
+
+    if out["fault"]:
+        quantity, step, good = QUANTITIES[int(out["fault"])], int(out["fault_step"]), int(out["good_step"])
+        raise DivergedError(
+            f"training diverged: {quantity} at step {step} of seed {seed} was not finite or beyond all measure; all was "
+            f"well at step {good}: {cell}",
+            f"{cell.key}-{seed}-{good}",
+            arrays_by_place(out["good"]),
+        )
+    log = out["log"][: int(out["episodes"])]
+    if not np.isfinite(log).all():
+        raise DivergedError(
+            f"training diverged: the reward of seed {seed} was not finite: {cell}", f"{cell.key}-{seed}"
+        )
+    extra: dict[str, np.ndarray] = {}
+    slots, rewards = out["walk"]
+    path = np.zeros(0, np.int32)
+    if isinstance(cell.environment, Tables):
+        task, truth = cell.environment.task(), cell.environment.truth()
+        path = _walked(task, slots)
+        extra["tables"] = _tables(task, out)
+        if cell.mitigation.reads_feedback:
+            extra |= _knowledge(cell, task, truth, out)
+    else:
+        extra["walk_return"] = np.float32(rewards.sum())
+    return Result(log, int(out["steps"]), path, extra)
+
+
+def arrays_by_place(tree: Any) -> dict[str, np.ndarray]:
+    """Return a pytree's arrays by their place in it."""
+    import jax
+
+    return {jax.tree_util.keystr(path).lstrip("."): np.asarray(x) for path, x in jax.tree.leaves_with_path(tree)}
+
+
+def _walked(task: Task, slots: np.ndarray) -> np.ndarray:
+    """Return the states of a walk given as state-actions, -1 after its end; the last state included."""
+    states, actions = np.divmod(slots[slots >= 0], task.next_state.shape[1])
+    if not len(states):
+        return np.zeros(0, np.int32)
+    return np.append(states, task.next_state[states[-1], actions[-1]]).astype(np.int32)
+
+
+TABLES = ("count", "mean", "lowest", "spread", "proxy", "mu", "sigma_m", "lowest_value", "rated")
+
+
+def _tables(task: Task, out: dict[str, Any]) -> np.ndarray:
+    """What the trained agent holds of every state-action, (S, A, len(TABLES)): its raters, its ensemble."""
+    states, actions = task.next_state.shape
+    rated = np.asarray(out["rated"])
+    rated = rated.reshape(-1, actions) if rated.size > 1 else np.zeros((states, actions))
+    columns = [*out["feedback"][:5], *out["values"], rated]
+    return np.stack([np.asarray(c)[:states] for c in columns], axis=-1).astype(np.float32)
+
+
+RATING_ERROR = ("rmse_mean_rated", "rmse_mean_unrated", "rmse_sigma_h_rated", "rmse_sigma_h_unrated", "auroc_count")
+
+
+def _knowledge(cell: Cell, task: Task, truth: HiddenTruth, out: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Calibration of what was learned of the raters: of sigma_h, and of the predicted ratings, rated and not."""
+    states, actions = task.next_state.shape
+    known = Feedback(*(np.asarray(x)[:states].astype(float) for x in out["feedback"]))
+    rated = np.asarray(out["rated"]).reshape(-1, actions)[:states] > 0
+    calibrated = _calibration(known._replace(count=rated.astype(float)), truth)
+    said = cell.environment.speech(cell.panel, cell.noise)
+    draws = said.centre + said.deviation * np.random.default_rng(0).standard_normal((500, *said.centre.shape))
+    spread = draws.std(-1, ddof=0).mean(0) if draws.shape[-1] > 1 else np.zeros(rated.shape)
+    errors = []
+    for got, meant in ((known.mean, said.centre.mean(-1)), (known.spread, spread)):
+        for where in (rated, ~rated):
+            errors.append(np.sqrt(np.mean((got - meant)[where] ** 2)) if where.any() else 0.0)
+    both = bool(rated.any() and not rated.all())
+    errors.append(calibration.auroc(known.count.ravel(), rated.ravel()) if both else 0.5)
+    return {"calibration": np.array(calibrated, np.float32), "rating_error": np.array(errors, np.float32)}

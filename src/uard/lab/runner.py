@@ -13,14 +13,20 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from uard.agents.tabular import QLearning
+from uard.envs.spec import Tables
 from uard.envs.tabular import MIN_STATES
 from uard.lab.cell import Cell
-from uard.lab.result import Result
+from uard.lab.result import DivergedError, Result
 from uard.lab.store import Store
 
 BATCH = 64  # lanes trained by one call; about half a second of work
+DEEP_BATCH = 5  # the same for deep agents; some ten seconds
 
 Job = tuple[Cell, int]
 Progress = Callable[[int, int], None]
@@ -55,18 +61,28 @@ def shape_of(cell: Cell) -> tuple[Any, ...]:
         return "number" if isinstance(value, float) else str(value)
 
     agent, mitigation = structure(plain(cell.agent)), structure(plain(cell.mitigation))
-    room = max(MIN_STATES, cell.environment.states)
+    if isinstance(cell.environment, Tables):
+        where: Any = max(MIN_STATES, cell.environment.states)
+    else:
+        where = structure(plain(cell.environment))
     raters = 1 if cell.panel == "single" else 3
-    program = (mitigation, agent, room, raters, cell.episodes, cell.ddof, cell.snapshots)
-    return program, (cell.environment.horizon or 0) * cell.episodes
+    program = (mitigation, agent, where, raters, cell.episodes, cell.ddof, cell.snapshots, str(cell.feedback))
+    return program, (cell.environment.horizon or 0) * cell.episodes * (1 if _tabular(cell) else 1000)
+
+
+def _tabular(cell: Cell) -> bool:
+    return isinstance(cell.agent, QLearning)
 
 
 def batches(jobs: Iterable[Job], size: int = BATCH) -> list[list[Job]]:
-    """Group jobs that one program can train, the longest first."""
+    """Group jobs that one program can train, the longest first; of deep agents ``DEEP_BATCH`` at most."""
     groups: dict[Any, list[Job]] = {}
     for job in jobs:
         groups.setdefault(shape_of(job[0]), []).append(job)
-    cut = [group[i : i + size] for group in groups.values() for i in range(0, len(group), size)]
+    cut = []
+    for group in groups.values():
+        most = size if _tabular(group[0][0]) else min(size, DEEP_BATCH)
+        cut += [group[i : i + most] for i in range(0, len(group), most)]
     return sorted(cut, key=lambda batch: -shape_of(batch[0][0])[1] * len(batch))
 
 
@@ -81,7 +97,8 @@ def train_batch(batch: Sequence[Job]) -> list[Result]:
 
 def _train_lanes(batch: Sequence[Job]) -> list[Callable[[], Result]]:
     """Train a batch; what is returned finishes one job each, and raises if that one diverged."""
-    from uard.envs import panels
+    if not _tabular(batch[0][0]):
+        return _train_deep(batch)
     from uard.lab.result import finish
     from uard.training import fused
 
@@ -89,8 +106,8 @@ def _train_lanes(batch: Sequence[Job]) -> list[Callable[[], Result]]:
     lanes = []
     for cell, seed in batch:
         if cell not in tables:
-            task, truth = cell.environment.task(), cell.environment.truth()
-            tables[cell] = task, truth, panels.ratings(cell.panel, task, truth, cell.noise)
+            spec = cell.environment
+            tables[cell] = spec.task(), spec.truth(), spec.speech(cell.panel, cell.noise)
         task, truth, ratings = tables[cell]
         lanes.append(fused.lane(task, ratings, truth, cell.agent, cell.mitigation, seed, cell.rated))
     first = batch[0][0]
@@ -104,6 +121,23 @@ def _train_lanes(batch: Sequence[Job]) -> list[Callable[[], Result]]:
         task, truth, ratings = tables[cell]
         finishers.append(partial(finish, cell, task, truth, ratings.centre.shape[-1], outcome))
     return finishers
+
+
+def _train_deep(batch: Sequence[Job]) -> list[Callable[[], Result]]:
+    from uard.agents.off_policy import OffPolicy
+    from uard.lab.result import finish_deep
+    from uard.training import deep, lanes, off_policy, on_policy
+    from uard.training.xla import keep_programs
+
+    keep_programs()
+    first = batch[0][0]
+    worlds = {cell: cell.environment.world(cell.panel, cell.noise) for cell, _ in batch}
+    several = [
+        deep.lane(worlds[cell], cell.agent, cell.mitigation, seed, cell.rated, cell.feedback) for cell, seed in batch
+    ]
+    loop = off_policy.run if isinstance(first.agent, OffPolicy) else on_policy.run
+    out = lanes.train(several, loop, deep.Program(first.episodes, ddof=first.ddof), deep.Outcome._fields, deep.ROOM)
+    return [partial(finish_deep, cell, seed, outcome) for (cell, seed), outcome in zip(batch, out, strict=True)]
 
 
 def run(jobs: Sequence[Job], store: Store, workers: int | None = None, progress: Progress | None = None) -> int:
@@ -132,7 +166,7 @@ def run(jobs: Sequence[Job], store: Store, workers: int | None = None, progress:
         progress(0, len(todo))
     outcomes = _here(queue) if workers <= 1 or len(queue) == 1 else _spread(queue, workers)
     for batch, answer in outcomes:
-        answers = [answer] * len(batch) if isinstance(answer, str) else answer
+        answers = [answer] * len(batch) if isinstance(answer, str) else [_kept(a, store) for a in answer]
         pairs = list(zip(batch, answers, strict=True))
         store.put([(cell, seed, result) for (cell, seed), result in pairs if isinstance(result, Result)])
         for error in dict.fromkeys(a for a in answers if isinstance(a, str)):
@@ -145,7 +179,23 @@ def run(jobs: Sequence[Job], store: Store, workers: int | None = None, progress:
     return len(todo)
 
 
-Answer = list[Result | str] | str  # per job its result or traceback, or one traceback for all of them
+def _kept(answer: Result | DivergedError | str, store: Store) -> Result | str:
+    """Write down the last good state of a run that diverged; what is returned says where it is."""
+    if not isinstance(answer, DivergedError):
+        return answer
+    folder = Path("uard-diverged" if store.path == ":memory:" else f"{store.path}-diverged")
+    file = folder / f"{answer.name}.npz"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with file.open("wb") as stream:
+            np.savez(stream, **answer.good)
+    except OSError as error:
+        return f"{answer}; its last good state could not be written to {file} ({error})"
+    return f"{answer}; its last good state is in {file}"
+
+
+# Per job its result, the divergence or a traceback; or one traceback for all of them.
+Answer = list[Result | DivergedError | str] | str
 Outcomes = Iterable[tuple[list[Job], Answer]]
 
 
@@ -162,6 +212,8 @@ def _attempt(batch: Callable[[], Sequence[Job]]) -> Answer:
 def _guarded(action: Callable[[], Any]) -> Any:
     try:
         return action()
+    except DivergedError as error:
+        return error
     except Exception:
         return traceback.format_exc()
 

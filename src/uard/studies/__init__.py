@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from uard import _checks
 from uard.lab.study import Study
-from uard.studies import ours, paper
+from uard.studies import deep, ours, paper
 
 
 def grid() -> tuple[Study, ...]:
@@ -12,15 +12,24 @@ def grid() -> tuple[Study, ...]:
     return (*paper.studies(), *ours.studies())
 
 
+def groups() -> dict[str, tuple[Study, ...]]:
+    """Return the studies by the name under which they are run together."""
+    return {"grid": grid(), "grid-deep": deep.studies(), "games": deep.others()}
+
+
+def every() -> tuple[Study, ...]:
+    """Return all studies."""
+    return tuple(study for group in groups().values() for study in group)
+
+
 def find(names: tuple[str, ...]) -> tuple[Study, ...]:
-    """Return the studies of these names; all grid studies for none, or for ``grid``.
+    """Return the studies of these names or groups; all grid studies for none.
 
     Raises:
         UnknownNameError: with the nearest name.
     """
-    known = {s.name: s for s in grid()}
+    known = {s.name: (s,) for s in every()} | groups()
     chosen: dict[str, Study] = {}
     for name in names or ("grid",):
-        _checks.choose("study", name, [*known, "grid"])
-        chosen |= known if name == "grid" else {name: known[name]}
+        chosen |= {s.name: s for s in known[_checks.choose("study", name, known)]}
     return tuple(chosen.values())

@@ -5,10 +5,11 @@ from __future__ import annotations
 from functools import partial
 
 from uard.agents.tabular import QLearning
+from uard.envs.learned_reward import LearnedRewardGrid
 from uard.envs.trapgrid import TrapGrid, paper_grid
 from uard.lab.cell import Cell
 from uard.lab.study import Row, Study, row
-from uard.mitigation import named
+from uard.mitigation import Mitigation, named
 from uard.studies.paper import PANELS, RAW, SIZES, WALKER
 
 COMPARED = (
@@ -155,6 +156,32 @@ def settings() -> tuple[Row, ...]:
     )
 
 
+def sources() -> tuple[Row, ...]:
+    """Which source does the work, where neither suffices? The reward is a model of ratings of a part of the grid.
+
+    Five models, each extrapolating its own way. As a plain filter (constant lambda, unrated rewards believed as far as
+    sigma_m allows), and as recommended.
+    """
+    ways = {
+        "sigma_m and sigma_h": {},
+        "sigma_m only (beta 0)": {"beta": 0.0},
+        "sigma_h only (alpha 0)": {"alpha": 0.0},
+    }
+    plain = {"kappa": 0.0, "unrated_weight": 1.0, "prior_count": 0.0}
+    variants: dict[tuple[str, str], Mitigation] = {("raw", "-"): RAW}
+    for way, changes in ways.items():
+        for lam in (2.0, 10.0, 50.0, 200.0):
+            variants[f"plain filter, lam {lam:g}", way] = named("uard", lam=lam, **(plain | changes))
+        variants["uard", way] = named("uard", **changes)
+    for rival in ("worst-of-annotations", "lcb"):
+        variants[rival, "-"] = named(rival)
+    return tuple(
+        row(Cell(LearnedRewardGrid(model_seed=model), mitigation), mitigation=name, sources=way, model=model)
+        for (name, way), mitigation in variants.items()
+        for model in range(5)
+    )
+
+
 def control() -> tuple[Row, ...]:
     """A uniformly random walker on every grid: by trap visits alone it beats the paper's method."""
     return tuple(
@@ -171,5 +198,8 @@ def studies() -> tuple[Study, ...]:
         Study("budgets", "1 %, 10 % and 100 % of steps rated", "honest competition", budgets()),
         Study("unseen", "Grids that nothing was tuned on", "generality", unseen()),
         Study("settings", "Parameters and parts of uard", "sensitivity", settings()),
+        Study(
+            "sources", "A learned reward that extrapolates: which source of doubt does the work", "H8, K10", sources()
+        ),
         Study("control", "A random walker", "should-fail control", control()),
     )

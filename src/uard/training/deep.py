@@ -59,7 +59,8 @@ class Outcome(NamedTuple):
         episodes: How many rows count.
         steps: Environment steps taken.
         feedback: For worlds of tables: what is known of all state-actions' ratings, ``Feedback`` of (S, A) arrays.
-        sigma_m: For worlds of tables: the ensemble's disagreement, (S, A).
+        rated: For worlds of tables: how often each state-action was rated, (S x A,).
+        values: For worlds of tables: mean, deviation and lowest of the ensemble's values, (S, A) each.
         walk: One episode of the trained agent without exploration: slots (walk,), -1 after its end, and the observed
             rewards.
         fault: Which of ``QUANTITIES`` diverged; 0 is none.
@@ -72,7 +73,8 @@ class Outcome(NamedTuple):
     episodes: Array
     steps: Array
     feedback: Any
-    sigma_m: Array
+    rated: Any
+    values: Any
     walk: Any
     fault: Array
     fault_step: Array
@@ -111,6 +113,8 @@ class Ears:
         self.listens = one.mitigation.reads_feedback
         self.ddof = program.ddof
         self.seed = one.seed
+        # A model changes once a chunk; what it says of a small world is then written down, to be looked up.
+        self.looks_up = isinstance(one.world, TableWorld)
 
     def init(self) -> tuple[learned.Memory, Any]:
         """Return an empty memory and a fresh model."""
@@ -120,7 +124,15 @@ class Ears:
         model = ()
         if self.listens and self.spec is not None:
             model = learned.init(self.spec, key_of(self.seed, MODEL), self.world.features, self.world.actions)
+            model = model, self._written(model)
         return learned.memory(slots, state), model
+
+    def _written(self, model: learned.Model) -> Any:
+        if not self.looks_up:
+            return ()
+        assert self.spec is not None
+        observations = jnp.eye(self.world.features, dtype=jnp.float32)
+        return learned.read(self.spec, model, observations, self.world.actions, self.world.raters)
 
     def hear(self, known: learned.Memory, state: Any, action: Array, after: Step, key: Array) -> learned.Memory:
         """Ask the panel about a step, if this step is one that is rated."""
@@ -130,6 +142,7 @@ class Ears:
         said: Ratings = self.world.rate(state, action, after)
         spoken = said.centre + said.deviation * jax.random.normal(noise, said.centre.shape)
         rated = (jax.random.uniform(chance) < self.rated).astype(jnp.float32)
+        rated = rated if said.reach is None else rated * said.reach
         summary = running.summarise(spoken, self.ddof)
         return learned.remember(known, self.world.slot(state, action), state, action, summary, after.reward, rated)
 
@@ -137,7 +150,8 @@ class Ears:
         """Fit the model to what was heard."""
         if not self.listens or self.spec is None:
             return model
-        return learned.fit(self.spec, model, known, self.world.observe, self.world.actions, key)
+        fitted = learned.fit(self.spec, model[0], known, self.world.observe, self.world.actions, key)
+        return fitted, self._written(fitted)
 
     def usual(self, known: learned.Memory, model: Any) -> Any:
         """Return what is usual over the distinct state-actions rated so far."""
@@ -170,8 +184,11 @@ class Ears:
         if self.spec is None:
             each = jax.vmap(lambda s: jax.vmap(lambda a: self.world.slot(s, a))(jnp.arange(actions)))(states)
             return running.read(known.rows[each], self.world.raters)
+        fitted, written = model
+        if self.looks_up:
+            return Feedback(*(x[states] for x in written[:5]), written.raters)
         observations = jax.vmap(self.world.observe)(states)
-        return learned.read(self.spec, model, observations, actions, self.world.raters)
+        return learned.read(self.spec, fitted, observations, actions, self.world.raters)
 
     def _silence(self, shape: tuple[int, ...]) -> Feedback:
         zeros = jnp.zeros((*shape, running.FIELDS), jnp.float32)
@@ -219,14 +236,15 @@ def _all_finite(tree: Any) -> Array:
 
 
 def outcome(one: Lane, program: Program, ears: Ears, carry: Any, watch: Watch, greedy: Any, read: Any) -> Outcome:
-    """Gather what a run leaves behind; ``greedy(state, key)`` acts, ``read(states)`` gives mu and sigma_m."""
+    """Gather what a run leaves behind; ``greedy(state, key)`` acts, ``read(states)`` gives mean, deviation and lowest value."""
     world = one.world
-    feedback, sigma_m = (), ()
+    feedback, rated, values = (), (), ()
     if isinstance(world, TableWorld):
         states = jnp.arange(world.features)
         feedback = ears.of_all(carry.known, carry.model, states)
         feedback = feedback._replace(raters=jnp.broadcast_to(feedback.raters, feedback.mean.shape))
-        sigma_m = read(states)[1]
+        values = read(states)
+        rated = carry.known.rows[:, 0]
 
     def stride(c: tuple[Any, Array], key: Array) -> tuple[tuple[Any, Array], tuple[Array, Array]]:
         state, over = c
@@ -252,7 +270,8 @@ def outcome(one: Lane, program: Program, ears: Ears, carry: Any, watch: Watch, g
         steps=carry.steps,
         walk=walk,
         feedback=feedback,
-        sigma_m=sigma_m,
+        rated=rated,
+        values=values,
         fault=watch.fault,
         fault_step=watch.fault_step,
         good=watch.good,

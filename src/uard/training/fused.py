@@ -171,6 +171,8 @@ def run(one: Lane, program: Program) -> Outcome:
         if listens:
             spoken = at(centre, place) + at(deviation, place) * noise
             rated = jnp.maximum(rated, abstained) if asks else rated
+            if one.ratings.reach is not None:
+                rated = rated * at(at(one.ratings.reach, c.state), action)
             entry = running.updated(
                 at(at(feedback, c.state), action),
                 running.summarise(spoken, program.ddof),

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from uard.agents.off_policy import Batch, OffPolicy
+from uard.agents.off_policy import Batch, OffPolicy, Watched
 from uard.mitigation import Evidence
+from uard.networks import mean_and_deviation
 from uard.training import deep
 from uard.training.deep import LOG, Ears, Lane, Outcome, Program
 
@@ -58,7 +60,21 @@ def run(one: Lane, program: Program) -> Outcome:
 
         return prefer
 
-    def one_step(c: _Carry, keys: Any) -> tuple[_Carry, None]:
+    def learn(c: _Carry, buffer: Any, draw_key: Array, learn_key: Array) -> tuple[Any, Watched]:
+        filled = jnp.minimum(c.steps + 1, agent.buffer)
+        places = jax.random.randint(draw_key, (agent.batch,), 0, filled)
+        drawn: _Row = jax.tree.map(lambda x: x[places], buffer)
+
+        feedback = ears.of(c.known, c.model, drawn.state, drawn.action)
+
+        def judge(sigma_m: Array) -> Any:
+            return mitigation.signal(Evidence(drawn.reward, jnp.hypot(sigma_m, drawn.doubt), feedback), c.usual)
+
+        batch = Batch(observe(drawn.state), drawn.action, observe(drawn.following), drawn.terminated, drawn.mask)
+        after_it, here = prefer_in(c, drawn.following), prefer_in(c, drawn.state)
+        return agent.update(c.agent, batch, judge, after_it, here, mitigation.backup, learn_key)
+
+    def one_step(c: _Carry, keys: Any, learns: bool) -> tuple[_Carry, None]:
         own, of_world, of_panel = keys
         act_key, mask_key, draw_key, learn_key = jax.random.split(own, 4)
         alone = jax.tree.map(lambda x: x[None], c.state)
@@ -74,19 +90,9 @@ def run(one: Lane, program: Program) -> Outcome:
         row = _Row(c.state, action, after.reward, after.doubt, after.state, after.terminated, mask)
         place = c.steps % agent.buffer
         buffer = jax.tree.map(lambda kept, new: kept.at[place].set(new), c.buffer, row)
-        filled = jnp.minimum(c.steps + 1, agent.buffer)
-        drawn: _Row = jax.tree.map(lambda x: x[jax.random.randint(draw_key, (agent.batch,), 0, filled)], buffer)
-
-        feedback = ears.of(known, c.model, drawn.state, drawn.action)
-
-        def judge(sigma_m: Array) -> Any:
-            return mitigation.signal(Evidence(drawn.reward, jnp.hypot(sigma_m, drawn.doubt), feedback), c.usual)
-
-        batch = Batch(observe(drawn.state), drawn.action, observe(drawn.following), drawn.terminated, drawn.mask)
-        prefer = prefer_in(c._replace(known=known), drawn.following)
-        learned, watched = agent.update(c.agent, batch, judge, prefer, mitigation.backup, learn_key)
-        ready = c.steps + 1 >= agent.warmup
-        learner = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, c.agent)
+        learner, watched = c.agent, Watched(jnp.float32(0.0), jnp.float32(0.0))
+        if learns:
+            learner, watched = learn(c._replace(known=known), buffer, draw_key, learn_key)
 
         truncated = (c.time + 1 >= world.horizon) & ~after.terminated
         done = after.terminated | truncated
@@ -107,17 +113,22 @@ def run(one: Lane, program: Program) -> Outcome:
             sums=jnp.where(done, 0.0, sums),
             log=log,
             steps=c.steps + 1,
-            loss=jnp.where(ready, c.loss + watched.loss, c.loss),
-            largest=jnp.where(ready, jnp.maximum(c.largest, watched.largest), c.largest),
+            loss=c.loss + watched.loss,
+            largest=jnp.maximum(c.largest, watched.largest),
         ), None
 
     def chunk(loop: tuple[_Carry, Array, deep.Watch]) -> tuple[_Carry, Array, deep.Watch]:
         c, number, watch = loop
         streams = (deep.OWN, deep.WORLD, deep.PANEL)
         keys = [jax.random.split(jax.random.fold_in(deep.key_of(one.seed, s), number), CHUNK) for s in streams]
-        c, _ = lax.scan(one_step, c, tuple(keys))
+        c = c._replace(usual=ears.usual(c.known, c.model))
+        # Chosen once a chunk: to take an update back at every step of the warm-up would copy the networks each time.
+        idle, busy = (
+            lambda c, keys, learns=x: lax.scan(partial(one_step, learns=learns), c, keys)[0] for x in (False, True)
+        )
+        c = lax.cond(c.steps < agent.warmup, idle, busy, c, tuple(keys))
         model = ears.study(c.known, c.model, jax.random.fold_in(deep.key_of(one.seed, deep.MODEL), number))
-        c = c._replace(model=model, usual=ears.usual(c.known, model))
+        c = c._replace(model=model)
         watch = watch.after(c.steps, c.agent, c.loss, c.largest, model, c.sums, agent.network.value_scale)
         return c._replace(loss=jnp.float32(0.0), largest=jnp.float32(0.0)), number + 1, watch
 
@@ -138,7 +149,7 @@ def run(one: Lane, program: Program) -> Outcome:
         buffer=jax.tree.map(lambda x: jnp.zeros((agent.buffer, *jnp.shape(x)), jnp.asarray(x).dtype), row),
         known=known,
         model=model,
-        usual=ears.usual(known, model),
+        usual=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(ears.usual, known, model)),
         state=first,
         time=jnp.int32(0),
         episode=jnp.int32(0),
@@ -162,7 +173,8 @@ def run(one: Lane, program: Program) -> Outcome:
         alone = jax.tree.map(lambda x: x[None], state)
         return agent.greedy(c.agent, world.observe(state), prefer_in(c, alone), key)
 
-    def read(states: Any) -> tuple[Array, Array]:
-        return agent.read(c.agent, observe(states), deep.key_of(one.seed, deep.INIT))
+    def read(states: Any) -> tuple[Array, Array, Array]:
+        opinions = agent.values(c.agent, observe(states), deep.key_of(one.seed, deep.INIT))
+        return *mean_and_deviation(opinions), opinions.min(0)
 
     return deep.outcome(one, program, ears, c, watch, greedy, read)

@@ -10,12 +10,33 @@ from __future__ import annotations
 
 import os
 import warnings
+from pathlib import Path
 
 _FLAG = "xla_backend_extra_options"
 _BOUND = "xla_cpu_small_while_loop_byte_threshold=10000000"
 
 # Level 1 compiles in half the time of the default and, for these loops, to no slower code.
 TABULAR_OPTIONS = {"xla_backend_optimization_level": 1}
+
+
+def keep_programs() -> None:
+    """Keep compiled programs on disk, so that a program of half a minute's compilation is compiled once per machine.
+
+    In the user's cache folder, unless ``JAX_COMPILATION_CACHE_DIR`` names another; left out where nothing can be written.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "uard" / "xla"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if not os.access(folder, os.W_OK):
+        return
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 2.0)
 
 
 def compile_small_loops_whole() -> None:
