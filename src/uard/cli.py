@@ -74,6 +74,8 @@ class Reproduce:
     """Number of seeds (0, 1, ...)."""
     report: str | None = None
     """Write the report into this folder; only possible for the whole grid."""
+    extract: str | None = None
+    """Write what the report needs of these studies to this small JSON file (- for standard output)."""
     store: str = DEFAULT_STORE
     """Where finished seeds are kept."""
     workers: int | None = None
@@ -281,11 +283,17 @@ def _reproduce(command: Reproduce, console: Console) -> None:
         raise _invalid("report", command.report, "left out unless all grid studies are run")
     if command.report:
         _check_writable("report", command.report, Path(command.report))
+    _check_json(command.extract)
     store = Store(command.store)
     seeds = range(command.seeds)
     jobs = [job for study in chosen for job in study.jobs(seeds)]
     trained = _train(jobs, store, console, f"{len(chosen)} studies, {len(set(jobs))} runs", command.workers)
     console.print(f"{trained} runs trained, {len(set(jobs)) - trained} were in {command.store} already")
+    if command.extract is not None:
+        from uard.reporting import published
+
+        line = f"uard reproduce {' '.join(command.studies)} --seeds {command.seeds}"
+        _write_json(published.extract(chosen, store, seeds, line), command.extract)
     if command.report:
         from uard.reporting import page
 

@@ -224,7 +224,8 @@ class RewardDiscounting(Mitigation):
         kappa: Gain of the adaptive lambda_t (A44) >= 0; 0 keeps lambda constant.
         proxy_is_rater: Count the observed reward as one more rater in sigma_h.
         standardise: Measure sigmas in units of the running scale of the observed reward.
-        unrated_weight: How far a reward is believed that nobody has rated yet, in [0, 1], on top of the ensemble's doubt.
+        unrated_weight: How far a reward is believed that nobody has rated yet, in [0, 1], on top of the ensemble's
+            doubt.
         prior_count: Pseudo-count >= 0 with which anchor and trust of few ratings are drawn towards those of an
             unrated step (the usual lowest rating, ``unrated_weight``).
         backup: See ``Mitigation``.
@@ -253,14 +254,22 @@ class RewardDiscounting(Mitigation):
         """Measure what is usual; see ``Usual``."""
         return measure_usual(feedback, seen, self.proxy_is_rater)
 
-    def weight(self, mu: Array, proxy: Array, sigma_m: Array, feedback: Feedback, usual: Usual) -> Array:
-        """Return w for something of size ``mu`` whose observed reward is ``proxy``."""
+    def disagreement(self, proxy: Array, feedback: Feedback) -> Array:
+        """Return sigma_h of steps whose observed reward is ``proxy``; 0 where nobody has rated."""
         sigma_h = feedback.spread
         if self.proxy_is_rater:
             sigma_h = uncertainty.with_proxy(feedback.mean, sigma_h, proxy, feedback.raters)
-        sigma_h = _where(feedback.count > 0, sigma_h, 0.0)
+        return _where(feedback.count > 0, sigma_h, 0.0)
+
+    def coefficient(self, sigma_h: Array, usual: Usual) -> Array:
+        """Return lambda_t (A44), which rises with how unusual sigma_h is."""
         z = adaptation.standing(sigma_h, *usual.disagreement, floor=_DEVIATION_FLOOR * usual.scale)
-        lam = adaptation.adaptive_lambda(z, self.filter.lam, self.kappa)
+        return adaptation.adaptive_lambda(z, self.filter.lam, self.kappa)
+
+    def weight(self, mu: Array, proxy: Array, sigma_m: Array, feedback: Feedback, usual: Usual) -> Array:
+        """Return w for something of size ``mu`` whose observed reward is ``proxy``."""
+        sigma_h = self.disagreement(proxy, feedback)
+        lam = self.coefficient(sigma_h, usual)
         unit = usual.scale if self.standardise else 1.0
         weight = self.filter.weight(
             sigma_m / unit, sigma_h / unit, mu=(mu if self.anchor == "zero" else abs(mu)) / unit, lam=lam

@@ -7,6 +7,7 @@ per member, (N, B, outputs); its mean is mu, its deviation sigma_m (A16, A17).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -106,7 +107,7 @@ def mlp(key: Array, sizes: tuple[int, ...], members: int | None = None, last_gai
     """Draw a stack of layers; ``members`` independent ones if given."""
     keys = jax.random.split(key, len(sizes) - 1)
     gains = [2.0**0.5] * (len(sizes) - 2) + [last_gain]
-    pairs = zip(sizes[:-1], sizes[1:], strict=True)
+    pairs = pairwise(sizes)
     return tuple(layer(k, a, b, members, g) for k, (a, b), g in zip(keys, pairs, gains, strict=True))
 
 

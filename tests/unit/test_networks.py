@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import jax
@@ -19,8 +20,13 @@ KEY = jax.random.key(0)
 ENSEMBLES = [SINGLE, Ensemble("full", 3), Ensemble("shared", 3), Ensemble("dropout", 3)]
 
 
+@cache
+def drawer(ensemble: Ensemble) -> Any:
+    return jax.jit(lambda key: networks.init(ensemble, NETWORK, key, FEATURES, ACTIONS))
+
+
 def drawn(ensemble: Ensemble, seed: int = 0) -> Weights:
-    return networks.init(ensemble, NETWORK, jax.random.key(seed), FEATURES, ACTIONS)
+    return drawer(ensemble)(jax.random.key(seed))
 
 
 def seen(seed: int = 1) -> jax.Array:
@@ -75,7 +81,7 @@ def test_members_of_a_full_ensemble_share_nothing():
 
 def test_heads_of_a_shared_ensemble_stand_on_one_trunk():
     ensemble = Ensemble("shared", 3, prior_scale=0.0)
-    weights = drawn(ensemble)
+    weights = drawn(Ensemble("shared", 3))
     assert [layer.weight.shape for layer in weights.layers] == [(6, 8), (8, 8), (8, 9)]
     out = values(ensemble, weights, seen())
     flat = 5.0 * by_hand(weights.layers, seen())
@@ -89,7 +95,7 @@ def test_heads_of_a_shared_ensemble_stand_on_one_trunk():
 @pytest.mark.parametrize("kind", ["full", "shared"])
 def test_priors_are_added_and_never_learned(kind: Any):
     ensemble = Ensemble(kind, 3, prior_scale=0.7)
-    weights = drawn(ensemble)
+    weights = drawn(Ensemble(kind, 3))
     with_prior = values(ensemble, weights, seen())
     without = values(Ensemble(kind, 3, prior_scale=0.0), weights, seen())
     twice = values(Ensemble(kind, 3, prior_scale=1.4), weights, seen())
@@ -106,7 +112,7 @@ def test_priors_are_added_and_never_learned(kind: Any):
 
 def test_dropout_passes_differ_by_what_they_drop():
     ensemble = Ensemble("dropout", 5, dropout=0.5)
-    weights = drawn(ensemble)
+    weights = drawn(Ensemble("dropout", 3))
     out = values(ensemble, weights, seen())
     assert all((out[i] != out[j]).any() for i in range(5) for j in range(i))
     again = np.asarray(networks.values(ensemble, NETWORK, weights, seen(), jax.random.key(1)))

@@ -489,7 +489,9 @@ def test_the_mitigation_judges_the_whole_rollout(name):
 def test_cpo_side_by_side_steps_as_alone():
     agent = traceable(CPO(network=SMALL))
     excess = jnp.array([-0.02, 0.0, 0.5], jnp.float32)
-    cases = [(sharp_policy(i, 1.0), random_batch(i), jnp.sin(jnp.arange(BATCH, dtype=jnp.float32) + i)) for i in range(3)]
+    cases = [
+        (sharp_policy(i, 1.0), random_batch(i), jnp.sin(jnp.arange(BATCH, dtype=jnp.float32) + i)) for i in range(3)
+    ]
     both = jax.jit(jax.vmap(agent.constrained))(*jax.tree.map(lambda *x: jnp.stack(x), *cases), excess)
     for i, case in enumerate(cases):
         alone = constrained(agent, *case, excess[i])

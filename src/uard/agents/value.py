@@ -4,8 +4,8 @@
 * Ensemble-DQN: bootstrapped members [Osband et al. 2016], acting on their mean.
 * CQL [Kumar et al. 2020, eq. 4, the CQL(H) term]: ``conservative`` times the gap between the soft maximum of the values
   and the value of the action in the buffer.
-* SUNRISE [Lee et al. 2021]: acts on mu + ``ucb`` sigma, and weighs each backup by sigmoid(-``temperature`` sigma') + 0.5,
-  sigma' the deviation of the members' targets at the next state-action.
+* SUNRISE [Lee et al. 2021]: acts on mu + ``ucb`` sigma, and weighs each backup by sigmoid(-``temperature`` sigma') +
+  0.5, sigma' the deviation of the members' targets at the next state-action.
 * UARD is not here: it is a mitigation, and works with each of them.
 """
 

@@ -1,7 +1,8 @@
 """A grid whose reward was learned: the observed reward is a model of ratings, and is wrong where nobody rated.
 
 Ours, built to ask which source of doubt does the work (K10). Raters have rated part of a grid; an ensemble of
-regressions on their mean ratings predicts the reward of every cell, and its mean is what an agent is paid. Two things go wrong:
+regressions on their mean ratings predicts the reward of every cell, and its mean is what an agent is paid. Two things
+go wrong:
 
 * inside the rated part stands a trap of which the raters disagree: the model has learned their mean, which pays. The
   ensemble agrees there, so sigma_m is small; sigma_h is large;

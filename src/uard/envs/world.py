@@ -1,9 +1,9 @@
 """What an environment is to a compiled training loop: pure functions of a compact state.
 
 A world is a pytree (its numbers are data, so that one program serves many worlds) with the methods of ``World``, each
-for one state; loops map them over batches. What an agent may see of a step is what ``observe``, ``step`` and the panel's
-ratings give. ``judge`` is for evaluation only: loops write it into their log and hand it to no agent, feedback model or
-mitigation.
+for one state; loops map them over batches. What an agent may see of a step is what ``observe``, ``step`` and the
+panel's ratings give. ``judge`` is for evaluation only: loops write it into their log and hand it to no agent, feedback
+model or mitigation.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from uard.envs.tabular import MIN_STATES, HiddenTruth, Ratings, Task, pad
@@ -153,7 +154,7 @@ class TableWorld:
     def reset(self, key: Array) -> Array:
         """Draw one of the starts."""
         starts = jnp.atleast_1d(jnp.asarray(self.task.start, jnp.int32))
-        return starts[0] if starts.shape[0] == 1 else jax.random.choice(key, starts)
+        return starts[jax.random.randint(key, (), 0, starts.shape[0])]
 
     def step(self, state: Array, action: Array, key: Array) -> Step:
         """Look the step up."""
@@ -182,4 +183,6 @@ class TableWorld:
 def table_world(task: Task, truth: HiddenTruth, said: Ratings, states: int = MIN_STATES) -> TableWorld:
     """Build a world of tables, padded so that small ones share one compiled program."""
     states = max(states, task.next_state.shape[0])
+    starts = np.atleast_1d(np.asarray(task.start, np.int32))
+    task = task._replace(start=np.resize(starts, max(len(starts), 2)))  # one start twice: the same program as for two
     return TableWorld(pad(task, states), pad(truth, states), pad(said, states))

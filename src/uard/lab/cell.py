@@ -57,7 +57,8 @@ class Cell:
         """Check everything; forget what cannot matter.
 
         Raises:
-            InvalidValueError: a field out of range, or an agent that cannot work in the environment, with those that can.
+            InvalidValueError: a field out of range, or an agent that cannot work in the environment, with those that
+                can.
         """
         _checks.choose("panel", self.panel, PANELS)
         _checks.number("noise", self.noise, low=0)
@@ -89,7 +90,7 @@ class Cell:
             object.__setattr__(self, name, kind(getattr(self, name)))
 
     def config(self) -> dict[str, Any]:
-        """Return the whole configuration as plain data; without ``feedback`` where it is none, as before it was added."""
+        """Return the whole configuration as plain data; without ``feedback`` where it is none."""
         config = plain(self)
         if self.feedback is None:
             del config["feedback"]

@@ -201,8 +201,8 @@ def finish_deep(cell: Cell, seed: int, out: dict[str, Any]) -> Result:
     if out["fault"]:
         quantity, step, good = QUANTITIES[int(out["fault"])], int(out["fault_step"]), int(out["good_step"])
         raise DivergedError(
-            f"training diverged: {quantity} at step {step} of seed {seed} was not finite or beyond all measure; all was "
-            f"well at step {good}: {cell}",
+            f"training diverged: {quantity} at step {step} of seed {seed} was not finite or beyond all measure; all "
+            f"was well at step {good}: {cell}",
             f"{cell.key}-{seed}-{good}",
             arrays_by_place(out["good"]),
         )

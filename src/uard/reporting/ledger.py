@@ -1,8 +1,8 @@
 """The ledger: every claim of the paper that a grid can answer, what was run, our number, and a verdict.
 
 A verdict on a number is computed from it by the condition beside it. Where a claim has parts that no number answers (a
-derivation, a cross-reference, MuJoCo), that part is our reading of the text, and ``why`` says so. Claims about deep
-agents and MuJoCo stand here as "cannot be tested" with the reason until those agents exist.
+derivation, a cross-reference, MuJoCo), that part is our reading of the text, and ``why`` says so. Claims about deep agents are answered
+from the published results; those about MuJoCo stand here as "cannot be tested" with the reason until it is run.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from uard import __version__, statistics
 from uard.reliability import ReliabilityFilter, reciprocal_weight, wiener_weight
-from uard.reporting import paper, theory
+from uard.reporting import deep, paper, published, theory
 from uard.reporting.evidence import Evidence
 from uard.reporting.tables import full, number
 from uard.statistics import Summary
@@ -145,11 +145,21 @@ def _f3(e: Evidence) -> _Answer:
     goal = e.get("table3", "goal_rate", agent="uard-paper", horizon=100, panel="main")
     dqn, uard = paper.TABLE_3[0].visits.mean / 100, paper.TABLE_3[-1].visits.mean / 100
     good = [abs(base.mean - dqn) <= 1.0, abs(ours.mean - uard) <= 1.0, goal.mean > 0.5]
+    p = published.packaged()
+    agents = {r["agent"]: p.of(r, "trap_visits") for r in p.rows("deep-baselines", horizon=100, mitigation="raw")}
+    printed = {deep.AGENT[row.method]: row.visits for row in paper.TABLE_3 if row.method in deep.AGENT}
+    close = {a: abs(agents[a].mean - v.mean / 100) <= v.sd / 100 for a, v in printed.items() if a in agents}
+    of_deep = (
+        f"Of the deep baselines {sum(close.values())} of {len(close)} lie within the printed SD; ours: "
+        + ", ".join(f"{a} {number(s.mean)}" for a, s in agents.items())
+        + "."
+        if close
+        else "The deep baselines are not among the published results."
+    )
     why = (
         f"Epsilon-greedy tabular Q-learning at T = 100 makes {number(base.mean)} visits (paper: DQN {dqn:.1f}, CQL "
         f"{paper.TABLE_3[1].visits.mean / 100:.1f}); T = 80 cannot. UARD as printed avoids traps but reaches the goal in "
-        f"{_percent(100 * goal.mean)} of episodes; a random walker makes {number(walker.mean)} visits. The deep "
-        "baselines themselves are not run on this page."
+        f"{_percent(100 * goal.mean)} of episodes; a random walker makes {number(walker.mean)} visits. {of_deep}"
     )
     ours_text = f"baseline {full(base)}; uard-paper {full(ours)}; random walk {full(walker)}"
     return "study table3, T = 100, main panel, visits per episode", ours_text, _verdict(sum(good), 3), why
@@ -250,11 +260,14 @@ def _i3(e: Evidence) -> _Answer:
     rivals = {
         a: e.per_seed("table3", "trap_visits", agent=a, horizon=100, panel="main") for a in ("baseline", "random walk")
     }
+    p = published.packaged()
+    for r in p.rows("deep-baselines", horizon=100, mitigation="raw"):
+        rivals[r["agent"]] = p.per_seed(r, "trap_visits")
     raw = [statistics.welch(ours, x).p for x in rivals.values()]
     holm, bonferroni = statistics.holm(raw), statistics.bonferroni(raw)
     text = "; ".join(f"{a}: Holm {_p(h)}, Bonferroni {_p(b)}" for a, h, b in zip(rivals, holm, bonferroni, strict=True))
     good = [p < 0.001 for p in bonferroni]
-    why = "Tabular rows only; the deep baselines are not run on this page. Significance says nothing of the task: the walker, too, differs from the baseline."
+    why = "Significance says nothing of the task: the walker, too, differs from the baseline. Deep baselines where they are published."
     return "study table3: Welch, corrected", text, _verdict(sum(good), 2), why
 
 
@@ -537,20 +550,65 @@ def _j20(e: Evidence) -> _Answer:
     )
 
 
-_NOT_HERE = "Needs deep agents or MuJoCo; not on this page."
+_NOT_HERE = "Needs MuJoCo; not on this page."
 
 
-@_claim("J21", "J22", "J23", "J36", "J44", "J45")
+@_claim("J21", "J36", "J45")
 def _not_here(e: Evidence) -> _Answer:
     return "-", "-", UNTESTABLE, _NOT_HERE
+
+
+def _distorted(name: str) -> dict[str, Summary] | None:
+    """Return something of the distortion study by agent; None if it is not published."""
+    p = published.packaged()
+    rows = p.rows("deep-distortion")
+    if len(rows) < 3:
+        return None
+    return {r["agent"]: statistics.summarise(p.derived(r, name)) for r in rows}
+
+
+_UNPUBLISHED = "-", "-", UNTESTABLE, "Its study is not among the published results: uard reproduce grid-deep."
+_DISTORTED = "study deep-distortion: +1.5 on the reward for 60 of 1000 steps; definitions are ours, the paper has none"
+_UNEQUAL = "EDAC and SUNRISE read no ratings and cannot know of the lie, so it is no fair fight."
+
+
+@_claim("J22")
+def _j22(e: Evidence) -> _Answer:
+    count = _distorted("activations")
+    if count is None:
+        return _UNPUBLISHED
+    cut = 100 * (1 - count["uard"].mean / count["edac"].mean) if count["edac"].mean else 0.0
+    text = f"uard {brief_ci(count['uard'])}, EDAC {brief_ci(count['edac'])} activations: {_percent(cut)} fewer"
+    return _DISTORTED, text, _verdict(int(cut >= 92.0), 1), _UNEQUAL
+
+
+@_claim("J23")
+def _j23(e: Evidence) -> _Answer:
+    largest = _distorted("largest")
+    if largest is None:
+        return _UNPUBLISHED
+    ours, theirs = max(largest["uard"].mean, 1e-9), largest["sunrise"].mean
+    text = f"largest adjusted reward: SUNRISE {brief_ci(largest['sunrise'])}, uard {brief_ci(largest['uard'])}"
+    return _DISTORTED, text, _verdict(int(theirs > 5 * ours), 1), _UNEQUAL
+
+
+@_claim("J44")
+def _j44(e: Evidence) -> _Answer:
+    mean, largest = _distorted("mean_inside"), _distorted("largest")
+    if mean is None or largest is None:
+        return _UNPUBLISHED
+    good = [mean["edac"].mean - mean["uard"].mean > 0.1, largest["uard"].mean < 0.3]
+    text = f"EDAC exceeds uard by {number(mean['edac'].mean - mean['uard'].mean)} in the windows; uard's largest is {brief_ci(largest['uard'])}"
+    return _DISTORTED, text, _verdict(sum(good), 2), _UNEQUAL
 
 
 @_claim("J24")
 def _j24(e: Evidence) -> _Answer:
     tabled = len(paper.TABLE_3) - 1
+    ran = {r["agent"] for r in published.packaged().rows("deep-baselines", mitigation="raw")} - {"cpo-oracle"}
     return (
-        "count of the paper's tables",
-        f"{tabled} of 9 in a table",
+        "count of the paper's tables; ours in study deep-baselines",
+        f"{tabled} of 9 in a table; we ran {len(ran)}",
         _verdict(tabled, 9),
         "Four more appear in figures only, Ensemble-DQN nowhere.",
     )
@@ -726,11 +784,18 @@ def _j35(e: Evidence) -> _Answer:
 
 @_claim("J37")
 def _j37(e: Evidence) -> _Answer:
+    if speed := deep.packaged_json("speed.json"):
+        cost = {row["name"]: row["cost_of_single"] for row in speed["rows"]}
+        full, shared = cost["5 full networks"], cost["5 heads, shared trunk"]
+        text = f"5 full networks {full:.2f}, 5 heads on a shared trunk {shared:.2f} times a single network"
+        why = "A matter of code, not of method: an ensemble that shares its trunk is cheap, independent networks cost their arithmetic."
+        good = [2 <= full <= 3, 2 <= shared <= 3]
+        return "benchmarks/deep.py: DQN on 10x10, one core, per step", text, _verdict(sum(good), 2), why
     return (
         "-",
         "-",
         UNTESTABLE,
-        "A matter of code, not of method: `make bench` measures ours (five heads and `uard` against plain Q-learning). Deep ensembles are not on this page.",
+        "A matter of code, not of method; benchmarks/deep.py measures ours, and its numbers are not among the published results.",
     )
 
 

@@ -126,13 +126,13 @@ def feedback() -> tuple[Row, ...]:
     )
 
 
-def adversarial() -> tuple[Row, ...]:
-    """Trained agents whose reward is then distorted (H13, H15, H16); see ``uard.reporting.distortion``."""
+def distortion() -> tuple[Row, ...]:
+    """Agents trained on the true reward, whose reward is distorted afterwards (``uard.reporting.distortion``)."""
+    honest = TrapGrid(size=6, trap_reward=-1.0)
     return (
-        row(cell(paper_grid(6), named("uard"), ENSEMBLE), agent="uard"),
-        row(cell(paper_grid(6), RAW, AGENTS["edac"]), agent="edac"),
-        row(cell(paper_grid(6), RAW, AGENTS["sunrise"]), agent="sunrise"),
-        row(cell(paper_grid(6), named("lcb"), ENSEMBLE), agent="caution"),
+        row(cell(honest, named("uard"), ENSEMBLE), agent="uard"),
+        row(cell(honest, RAW, AGENTS["edac"]), agent="edac"),
+        row(cell(honest, RAW, AGENTS["sunrise"]), agent="sunrise"),
     )
 
 
@@ -145,13 +145,13 @@ GAMES = {
         AbsentSupervisor(legitimate=legitimate),
     )
 }
-GAMING_EPISODES = 200
+GAMING_EPISODES = 100
 
 
 def gaming() -> tuple[Row, ...]:
     """The reward-gaming gridworlds and their legitimate twins: every agent with every mitigation.
 
-    200 episodes. Tomatoes pay 0.1 each, not the published 0.02, so that the raters' noise (sd 0.1 and more) does not
+    100 episodes. Tomatoes pay 0.1 each, not the published 0.02, so that the raters' noise (sd 0.1 and more) does not
     drown them.
     """
     agents = {"q-learning": QLearning(), **AGENTS}
@@ -187,7 +187,7 @@ def studies() -> tuple[Study, ...]:
         Study("deep-ablation", "Which component does the work, deep", "H8, F5", ablation()),
         Study("deep-ensembles", "Kinds of ensembles", "K4, K9", ensembles()),
         Study("deep-feedback", "A table or a model of the ratings", "A18", feedback()),
-        Study("deep-distortion", "A distorted reward after training", "H13, H15, H16, G12, G14, G15", adversarial()),
+        Study("deep-distortion", "A distorted reward after training", "H13, H15, H16, G12, G14, G15", distortion()),
     )
 
 

@@ -236,7 +236,7 @@ def _all_finite(tree: Any) -> Array:
 
 
 def outcome(one: Lane, program: Program, ears: Ears, carry: Any, watch: Watch, greedy: Any, read: Any) -> Outcome:
-    """Gather what a run leaves behind; ``greedy(state, key)`` acts, ``read(states)`` gives mean, deviation and lowest value."""
+    """Gather what a run leaves behind; ``greedy`` acts, ``read`` gives mean, deviation and lowest value."""
     world = one.world
     feedback, rated, values = (), (), ()
     if isinstance(world, TableWorld):

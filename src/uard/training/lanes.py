@@ -1,8 +1,8 @@
 """Many runs in one compiled program.
 
-A *lane* is one run as data: environment, agent, mitigation, seed. ``train`` runs any number of lanes one after the other
-inside one program (``lax.fori_loop``), which on a CPU beats stepping them side by side: a lane's arrays stay in the cache
-and no lane waits for another. Whatever is not a number is fixed when the program is compiled.
+A *lane* is one run as data: environment, agent, mitigation, seed. ``train`` runs any number of lanes one after the
+other inside one program (``lax.fori_loop``), which on a CPU beats stepping them side by side: a lane's arrays stay in
+the cache and no lane waits for another. Whatever is not a number is fixed when the program is compiled.
 """
 
 from __future__ import annotations

@@ -22,7 +22,8 @@ TABULAR_OPTIONS = {"xla_backend_optimization_level": 1}
 def keep_programs() -> None:
     """Keep compiled programs on disk, so that a program of half a minute's compilation is compiled once per machine.
 
-    In the user's cache folder, unless ``JAX_COMPILATION_CACHE_DIR`` names another; left out where nothing can be written.
+    In the user's cache folder, unless ``JAX_COMPILATION_CACHE_DIR`` names another; left out where nothing can be
+    written.
     """
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return

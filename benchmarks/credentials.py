@@ -1,0 +1,168 @@
+"""Do our agents learn what others' do? CartPole-v1 and Acrobot-v1 beside Stable-Baselines3 and sb3-contrib.
+
+    python benchmarks/credentials.py [--seeds 10] [--their-seeds 3] [--only dqn ppo trpo] [--json FILE]
+
+Same budget of environment steps, network (64, 64), batch, buffer, discount. The number is the mean return of the
+training episodes that end in the last fifth of the budget, one per seed; the interval is over seeds (95 %, Student).
+Ours run on our own compiled CartPole and Acrobot, which the tests hold to Gymnasium's; theirs run on Gymnasium's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+
+import uard.training  # noqa: F401  (XLA's flags)
+from uard import __version__
+from uard.statistics import Summary, summarise
+
+BUDGET = {"dqn": 30_000, "ppo": 100_000, "trpo": 100_000}
+TASKS = ("CartPole", "Acrobot")
+GAMMA, RATE, VALUE_SCALE = 0.99, 1e-3, {"CartPole": 30.0, "Acrobot": 30.0}
+Returns = list[float]
+
+
+def late(ends: np.ndarray, returns: np.ndarray, budget: int) -> float:
+    """Mean return of the episodes that end in the last fifth of the budget."""
+    chosen = returns[(ends > 0.8 * budget) & (ends <= budget)]
+    return float(chosen.mean()) if len(chosen) else float(returns[-1])
+
+
+def ours(name: str, task: str, seeds: int) -> Returns:
+    from uard.agents.policy import PPO, TRPO
+    from uard.agents.value import DeepQ
+    from uard.envs.classic import Acrobot, CartPole
+    from uard.mitigation import named
+    from uard.networks import Network
+    from uard.training import deep, lanes, off_policy, on_policy
+    from uard.training.deep import LOG
+
+    network = Network(learning_rate=RATE, value_scale=VALUE_SCALE[task])
+    agents: dict[str, Any] = {
+        "dqn": DeepQ(network, gamma=GAMMA, epsilon_decay=0.98),
+        "ppo": PPO(network, gamma=GAMMA, count_bonus=0.0),
+        "trpo": TRPO(network, gamma=GAMMA, count_bonus=0.0),
+    }
+    budget = BUDGET[name]
+    world = (CartPole() if task == "CartPole" else Acrobot()).world()
+    loop = off_policy.run if name == "dqn" else on_policy.run
+    program = deep.Program(budget // 8, budget)
+    several = [deep.lane(world, agents[name], named("raw"), seed) for seed in range(seeds)]
+    found = []
+    for out in lanes.train(several, loop, program, deep.Outcome._fields, deep.ROOM):
+        assert not out["fault"], deep.QUANTITIES[int(out["fault"])]
+        log = out["log"][: int(out["episodes"])]
+        ends = np.cumsum(log[:, LOG.index("length")])
+        found.append(late(ends, log[:, LOG.index("observed_return")], budget))
+    return found
+
+
+def theirs(name: str, task: str, seeds: int) -> Returns:
+    import gymnasium
+    import torch
+    from sb3_contrib import TRPO
+    from stable_baselines3 import DQN, PPO
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    torch.set_num_threads(1)
+    net: dict[str, Any] = {"policy_kwargs": {"net_arch": [64, 64]}, "gamma": GAMMA, "device": "cpu"}
+    found = []
+    for seed in range(seeds):
+        copies = 1 if name == "dqn" else 8
+        env = DummyVecEnv([lambda: Monitor(gymnasium.make(f"{task}-v1"))] * copies)
+        agent: Any
+        if name == "dqn":
+            agent = DQN(
+                "MlpPolicy",
+                env,
+                learning_rate=RATE,
+                batch_size=64,
+                buffer_size=10_000,
+                learning_starts=500,
+                train_freq=1,
+                gradient_steps=1,
+                target_update_interval=250,
+                exploration_fraction=0.16,
+                seed=seed,
+                **net,
+            )
+        elif name == "ppo":
+            # 8 x 32 steps, 4 minibatches, 4 epochs, as ours; gae_lambda and clip are the same, too.
+            agent = PPO(
+                "MlpPolicy",
+                env,
+                learning_rate=RATE,
+                n_steps=32,
+                batch_size=64,
+                n_epochs=4,
+                ent_coef=0.01,
+                seed=seed,
+                **net,
+            )
+        else:
+            agent = TRPO(
+                "MlpPolicy", env, learning_rate=RATE, n_steps=32, batch_size=64, target_kl=0.01, seed=seed, **net
+            )
+        episodes = _Episodes()
+        agent.learn(BUDGET[name], callback=episodes)
+        found.append(late(np.array(episodes.ends), np.array(episodes.returns), BUDGET[name]))
+    return found
+
+
+class _Episodes:
+    """A callback that notes when each episode ended, and its return."""
+
+    def __init__(self) -> None:
+        self.ends: list[int] = []
+        self.returns: list[float] = []
+
+    def __call__(self, local: dict[str, Any], _: dict[str, Any]) -> bool:
+        for info in local["infos"]:
+            if "episode" in info:
+                self.ends.append(local["self"].num_timesteps)
+                self.returns.append(float(info["episode"]["r"]))
+        return True
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--their-seeds", type=int, default=3)
+    parser.add_argument("--only", nargs="*", default=list(BUDGET), choices=list(BUDGET))
+    parser.add_argument("--ours-only", action="store_true")
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    rows = []
+    for name in arguments.only:
+        for task in TASKS:
+            runs: dict[str, tuple[Callable[..., Returns], int]] = {"ours": (ours, arguments.seeds)}
+            if not arguments.ours_only:
+                runs["theirs"] = (theirs, arguments.their_seeds)
+            for who, (train, seeds) in runs.items():
+                start = time.perf_counter()
+                returns = train(name, task, seeds)
+                summary: Summary = summarise(returns)
+                low, high = summary.ci95
+                took = time.perf_counter() - start
+                print(
+                    f"{task:9s} {name:5s} {who:7s} {summary.mean:7.1f} ± {summary.sd:5.1f} [{low:6.1f}, {high:6.1f}] "
+                    f"{seeds} seeds, {BUDGET[name]} steps, {took:.0f} s",
+                    flush=True,
+                )
+                rows.append({"task": task, "agent": name, "who": who, "budget": BUDGET[name], "returns": returns})
+                if arguments.json:
+                    arguments.json.write_text(json.dumps({"version": __version__, "rows": rows}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
