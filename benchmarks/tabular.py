@@ -8,8 +8,6 @@ log. The leanest C loop leaves out what the defaults do not need, the heads' boo
 applies them, as the fused program does. Steps are environment steps actually taken; compilation is not counted.
 """
 
-# ruff: noqa: E402
-
 from __future__ import annotations
 
 import os

@@ -21,8 +21,7 @@ import optax
 from jax import Array, lax
 
 from uard import _checks, networks
-from uard.agents.off_policy import Batch, Judge, Prefer, Watched
-from uard.mitigation import Backup
+from uard.agents.off_policy import Backup, Batch, Judge, Prefer, Watched
 from uard.networks import Ensemble, Layer, Network, Weights
 
 LOG_TEMPERATURES = (-10.0, 3.0)  # beyond them Adam would only wind up
@@ -34,7 +33,8 @@ class SoftActorCritic:
 
     Attributes:
         network: Size and step size, the same for all deep agents; of the actor and of each critic.
-        ensemble: The critics.
+        ensemble: The critics. Fixed random priors do not go with the lowest of them: where nothing was seen it falls by
+            about their size, and the policy keeps away from what it does not know.
         gamma: Discount in [0, 1).
         entropy: Target entropy of the first update, as a share of log A, in [0, 1]; every update multiplies it by
             ``entropy_decay``, down to ``entropy_min``. A fixed share of 0.98 [Christodoulou 2019] never settles on a
@@ -51,7 +51,7 @@ class SoftActorCritic:
     """
 
     network: Network = field(default_factory=Network)
-    ensemble: Ensemble = field(default_factory=lambda: Ensemble("full", 2))
+    ensemble: Ensemble = field(default=Ensemble("full", 2, 0.0))
     gamma: float = 0.95
     entropy: float = 0.9
     entropy_decay: float = 0.9999
@@ -148,11 +148,11 @@ class SoftActorCritic:
             opinions = lax.stop_gradient(opinions)
             _, sigma = networks.mean_and_deviation(opinions)
             here = batch.action[:, None]
-            signal = judge(jnp.take_along_axis(sigma, here, -1)[:, 0])
-            target = signal.reward + jnp.where(batch.terminated, 0.0, self.gamma * value)
+            reward, share = judge(jnp.take_along_axis(sigma, here, -1)[:, 0])
+            target = reward + jnp.where(batch.terminated, 0.0, self.gamma * value)
             taken = jnp.take_along_axis(q, here[None], -1)[..., 0]
             error = (taken - lax.stop_gradient(target)) / scale
-            critics = (mask * signal.sample_weight * optax.losses.huber_loss(error)).mean()
+            critics = (mask * share * optax.losses.huber_loss(error)).mean()
             if q.shape[0] > 1:  # with diversity 0 this costs little, and diversity remains a number
                 critics += self.diversity * gradient_similarity(simplex_gradient(q / scale))
 
@@ -190,7 +190,7 @@ class State(NamedTuple):
 
 def edac(members: int = 5, diversity: float = 0.01, **changes: Any) -> SoftActorCritic:
     """Return EDAC: independent critics with diversified gradients."""
-    return SoftActorCritic(ensemble=Ensemble("full", members), diversity=diversity, **changes)
+    return SoftActorCritic(ensemble=Ensemble("full", members, 0.0), diversity=diversity, **changes)
 
 
 def _drawn(

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 from jax import Array
 
-from uard.mitigation import Backup, LearningSignal
+from uard.networks import Network
+
+Backup = Literal["greedy", "consistent"]  # which value the target takes: the best, or that of the best score
 
 
 class Batch(NamedTuple):
@@ -35,8 +37,8 @@ class Watched(NamedTuple):
     largest: Array
 
 
-# Of the ensemble's disagreement about the batch's state-actions (B,), the reward to learn from and its weight.
-Judge = Callable[[Array], LearningSignal]
+# Of the ensemble's disagreement about the batch's state-actions (B,), the reward to learn from and its weight (B,).
+Judge = Callable[[Array], tuple[Any, Any]]
 # Of mean values (B, A), their deviations (B, A) and the observations (B, features), the mitigation's scores (B, A).
 Prefer = Callable[[Array, Array, Array], Array]
 
@@ -46,12 +48,14 @@ class OffPolicy(Protocol):
     """A learner from a replay buffer; its methods are pure.
 
     Attributes:
+        network: Gives the unit of values.
         buffer: Transitions kept.
         batch: Transitions per update.
         warmup: Steps before the first update.
         bootstrap: Chance that a member learns from a transition.
     """
 
+    network: Network
     buffer: int
     batch: int
     warmup: int

@@ -79,7 +79,7 @@ class Batch(NamedTuple):
 
 
 class State(NamedTuple):
-    """Policy, critic and Adam's moments of both (TRPO's policy has none); CPO's ``Costs``, else ()."""
+    """Policy, critic and Adam's moments of both (TRPO uses the critic's only); CPO's ``Costs``, else ()."""
 
     policy: Layers
     value: Weights

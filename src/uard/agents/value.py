@@ -20,8 +20,7 @@ import optax
 from jax import Array
 
 from uard import _checks, networks
-from uard.agents.off_policy import Batch, Judge, Prefer, Watched
-from uard.mitigation import Backup
+from uard.agents.off_policy import Backup, Batch, Judge, Prefer, Watched
 from uard.networks import SINGLE, Ensemble, Network, Weights
 
 
@@ -146,12 +145,12 @@ class DeepQ:
             else:
                 opinions, targets, mask = taken, value, batch.mask.T
             _, sigma = networks.mean_and_deviation(jax.lax.stop_gradient(opinions))
-            signal = judge(sigma)
-            target = signal.reward + jnp.where(batch.terminated, 0.0, self.gamma * targets)
+            reward, share = judge(sigma)
+            target = reward + jnp.where(batch.terminated, 0.0, self.gamma * targets)
             error = (taken - jax.lax.stop_gradient(target)) / self.network.value_scale
             gap = conservative_gap(q, batch.action) / self.network.value_scale**2
             each = weight * optax.losses.huber_loss(error) + self.conservative * gap
-            return (mask * signal.sample_weight * each).mean(), jnp.max(jnp.abs(taken))
+            return (mask * share * each).mean(), jnp.max(jnp.abs(taken))
 
         (lost, largest), gradient = jax.value_and_grad(loss, has_aux=True)(state.weights.layers)
         rate = self.network.learning_rate

@@ -147,7 +147,7 @@ class GamingEnv(gymnasium.Env[Any, int]):
         info: dict[str, Any] = {"evaluation": Evaluation(true_reward, hack)}
         if self.panel is not None:
             step = np.asarray(reward), np.asarray(true_reward), np.asarray(hack)
-            centre, deviation = panels.say(self.panel, *step, self._noise)
+            centre, deviation, _ = panels.say(self.panel, *step, self._noise)
             info["ratings"] = centre + deviation * self.np_random.standard_normal(centre.shape)
         return self._rules.observe(self._state), reward, terminated, truncated, info
 

@@ -106,7 +106,7 @@ class LearnedRewardGrid:
     def task(self) -> Task:
         """Return what an agent meets: the model's mean as reward, its deviation as ``doubt``."""
         base = self.grid().task()
-        mean, doubt = (np.float32(x)[base.next_state] for x in self._model())
+        mean, doubt = (x.astype(np.float32)[base.next_state] for x in self._model())
         return base._replace(reward=mean, doubt=doubt)
 
     def truth(self) -> HiddenTruth:

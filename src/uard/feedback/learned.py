@@ -141,7 +141,7 @@ def read(spec: RatingModel, model: Model, observations: Array, actions: int, rat
 def fit(spec: RatingModel, model: Model, known: Memory, observe: Any, actions: int, key: Array) -> Model:
     """Train for ``fits`` minibatches of distinct rated steps; unchanged before the first rating."""
     seen = (known.rows[:, 0] > 0)[:, None]
-    total = jnp.maximum(seen.sum(), 1)
+    total = jnp.maximum(seen.sum(), 1).astype(jnp.float32)
     heard = known.rows[:, 1:]
     location = jnp.where(seen, heard, 0.0).sum(0) / total
     deviation = jnp.sqrt((jnp.where(seen, heard - location, 0.0) ** 2).sum(0) / total)

@@ -29,7 +29,7 @@ class Cell:
     """One environment, panel, agent and mitigation, trained for some episodes.
 
     Attributes:
-        environment: Where it learns.
+        environment: Where it learns: an ``uard.envs.spec.Spec``.
         mitigation: What the agent does about a reward that may lie.
         agent: The learner.
         panel: Who rates. Irrelevant, and therefore ignored, for a mitigation that reads no ratings.
@@ -42,7 +42,7 @@ class Cell:
             tabular agent always has).
     """
 
-    environment: Spec = field(default_factory=TrapGrid)
+    environment: Any = field(default_factory=TrapGrid)
     mitigation: Mitigation = field(default_factory=Raw)
     agent: Any = field(default_factory=QLearning)
     panel: str = "main"

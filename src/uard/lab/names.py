@@ -16,12 +16,12 @@ from uard.agents.value import DeepQ
 from uard.envs.classic import Acrobot, CartPole
 from uard.envs.gaming import AbsentSupervisor, BoatRace, TomatoWatering
 from uard.envs.panels import PANELS
-from uard.envs.spec import Spec, Tables
+from uard.envs.spec import Tables
 from uard.envs.trapgrid import TrapGrid
 from uard.mitigation import Mitigation
 from uard.networks import Ensemble, Network
 
-ENVIRONMENTS: dict[str, Spec] = {
+ENVIRONMENTS: dict[str, Any] = {
     "TrapGrid": TrapGrid(),
     **{f"TrapGrid{n}": TrapGrid(size=n) for n in (6, 8, 10)},
     **{f"TrapGrid{n}-Trap8": TrapGrid(size=n, trap_reward=8.0) for n in (6, 8, 10)},
@@ -131,7 +131,7 @@ def changed(base: Any, changes: dict[str, Any], what: str) -> Any:
     return dataclasses.replace(base, **given)
 
 
-def environment(name: str, changes: dict[str, Any]) -> Spec:
+def environment(name: str, changes: dict[str, Any]) -> Any:
     """Return an environment by name. A new size, unless more is said, brings its own traps, goal and horizon."""
     base = ENVIRONMENTS[_checks.choose("environment", name, ENVIRONMENTS)]
     if isinstance(base, TrapGrid) and changes.get("size", base.size) != base.size:

@@ -221,7 +221,7 @@ def finish_deep(cell: Cell, seed: int, out: dict[str, Any]) -> Result:
         if cell.mitigation.reads_feedback:
             extra |= _knowledge(cell, task, truth, out)
     else:
-        extra["walk_return"] = np.float32(rewards.sum())
+        extra["walk_return"] = np.asarray(rewards.sum(), np.float32)
     return Result(log, int(out["steps"]), path, extra)
 
 

@@ -188,7 +188,7 @@ def _kept(answer: Result | DivergedError | str, store: Store) -> Result | str:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with file.open("wb") as stream:
-            np.savez(stream, **answer.good)
+            np.savez(stream, **answer.good)  # type: ignore[arg-type]
     except OSError as error:
         return f"{answer}; its last good state could not be written to {file} ({error})"
     return f"{answer}; its last good state is in {file}"

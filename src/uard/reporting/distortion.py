@@ -74,8 +74,8 @@ def walk(cell: Cell, result: Result, seed: int) -> Trace:
     observed = np.array(rewards) + BONUS * inside()
     counts = inside() & ~np.asarray(task.terminal)[rows, columns]
     if isinstance(cell.mitigation, RewardDiscounting):
-        known = Feedback(*(at[k] for k in ("count", "mean", "lowest", "spread", "proxy")), 3.0)
-        every = Feedback(*(held[k] for k in ("count", "mean", "lowest", "spread", "proxy")), 3.0)
+        heard = ("count", "mean", "lowest", "spread", "proxy")
+        known, every = (Feedback._make([*(tables[k] for k in heard), 3.0]) for tables in (at, held))
         usual = cell.mitigation.usual(every, held["rated"] > 0)
         adjusted = cell.mitigation.signal(Evidence(observed, at["sigma_m"], known), usual).reward
         rival = RatedReward("bound")

@@ -174,7 +174,7 @@ class Ears:
             return running.read(known.rows[jax.vmap(self.world.slot)(states, actions)], self.world.raters)
         every = self.of_all(known, model, states)
         pick = [jnp.take_along_axis(x, actions[:, None], 1)[:, 0] for x in every[:5]]
-        return Feedback(*pick, every.raters)
+        return Feedback._make([*pick, every.raters])
 
     def of_all(self, known: learned.Memory, model: Any, states: Any) -> Feedback:
         """Return the feedback of all actions in states, (B, A) arrays."""
@@ -186,7 +186,7 @@ class Ears:
             return running.read(known.rows[each], self.world.raters)
         fitted, written = model
         if self.looks_up:
-            return Feedback(*(x[states] for x in written[:5]), written.raters)
+            return Feedback._make([*(x[states] for x in written[:5]), written.raters])
         observations = jax.vmap(self.world.observe)(states)
         return learned.read(self.spec, fitted, observations, actions, self.world.raters)
 
@@ -209,7 +209,7 @@ class Watch(NamedTuple):
         return Watch(jnp.int32(0), jnp.int32(0), agent, jnp.int32(0))
 
     def after(
-        self, steps: Array, agent: Any, loss: Array, largest: Array, model: Any, reward: Array, unit: Array
+        self, steps: Array, agent: Any, loss: Array, largest: Array, model: Any, reward: Array, unit: Array | float
     ) -> Watch:
         """Look at a chunk's results; name the first quantity that is not finite, or values beyond all measure."""
         bad = jnp.stack(

@@ -1,0 +1,185 @@
+"""What a deep learner knows of its raters: the memory of rated steps, and the model of all others."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from uard._checks import InvalidValueError
+from uard.envs.trapgrid import paper_grid
+from uard.envs.world import TableWorld
+from uard.feedback import learned, running
+from uard.feedback.learned import Memory, Model, RatingModel
+from uard.mitigation import Feedback
+
+SLOTS = 7
+
+
+def heard(steps: int, share: float) -> tuple[Memory, list[dict[str, Any]]]:
+    """Remember random steps, some of them rated; return the memory and the rated steps."""
+    rng = np.random.default_rng(0)
+    known = learned.memory(SLOTS, {"place": jnp.zeros(2, jnp.int32)})
+    remember = jax.jit(learned.remember)
+    kept = []
+    for _ in range(steps):
+        slot = int(rng.integers(SLOTS - 1))  # the last one is never met
+        said = np.float32(rng.normal(size=3))
+        rated = float(rng.random() < share)
+        state = {"place": jnp.asarray([slot // 2, 5], jnp.int32)}
+        known = remember(
+            known,
+            jnp.int32(slot),
+            state,
+            jnp.int32(slot % 2),
+            running.summarise(jnp.asarray(said), 0),
+            jnp.float32(said[0] + 1),
+            jnp.float32(rated),
+        )
+        if rated:
+            kept.append({"slot": slot, "said": said, "proxy": said[0] + 1})
+    return known, kept
+
+
+def test_memory_keeps_the_means_of_every_slot():
+    known, kept = heard(60, 0.6)
+    for slot in range(SLOTS):
+        mine = [k for k in kept if k["slot"] == slot]
+        count, *means = np.asarray(known.rows[slot])
+        assert count == len(mine)
+        if mine:
+            said = np.stack([k["said"] for k in mine])
+            expected = [said.mean(), said.min(1).mean(), said.std(1).mean(), np.mean([k["proxy"] for k in mine])]
+            np.testing.assert_allclose(means, expected, rtol=1e-4, atol=1e-5)
+            assert known.actions[slot] == slot % 2
+            np.testing.assert_array_equal(known.states["place"][slot], [slot // 2, 5])
+    assert not np.asarray(known.rows[SLOTS - 1]).any()
+
+
+def test_order_lists_the_rated_slots_once():
+    known, kept = heard(60, 0.6)
+    first = list(dict.fromkeys(k["slot"] for k in kept))
+    assert int(known.rated) == len(first) == SLOTS - 1
+    np.testing.assert_array_equal(known.order[: len(first)], first)
+
+
+def test_what_is_not_rated_is_not_remembered():
+    known, _ = heard(20, 0.0)
+    empty = learned.memory(SLOTS, {"place": jnp.zeros(2, jnp.int32)})
+    jax.tree.map(np.testing.assert_array_equal, known, empty)
+
+
+SPEC = RatingModel()
+WORLD = paper_grid(10).world()  # 100 states, no padding
+RATERS, STATES, ACTIONS = WORLD.raters, WORLD.features, WORLD.actions
+HALF = np.arange(STATES * ACTIONS) // ACTIONS % 2 == 0  # every second state
+
+
+def rated_world(slots: np.ndarray) -> Memory:
+    """A memory in which the panel was heard without noise about some slots."""
+    centre = np.asarray(WORLD.said.centre, float).reshape(-1, RATERS)
+    proxy = np.asarray(WORLD.task.reward).reshape(-1)
+    rows = np.stack([5 + 0 * proxy, centre.mean(1), centre.min(1), centre.std(1), proxy], 1) * slots[:, None]
+    which = np.flatnonzero(slots)
+    order = np.zeros(len(slots), np.int32)
+    order[: len(which)] = np.random.default_rng(0).permutation(which)
+    every = np.arange(len(slots), dtype=np.int32)
+    table = rows.astype(np.float32), every // ACTIONS, every % ACTIONS, order, np.int32(len(which))
+    return jax.tree.map(jnp.asarray, Memory(*table))
+
+
+@cache
+def fitted() -> Any:
+    def fit(world: TableWorld, known: Memory, chunks: Any) -> tuple[Model, Feedback]:
+        def once(i: Any, model: Model) -> Model:
+            return learned.fit(SPEC, model, known, world.observe, ACTIONS, jax.random.fold_in(jax.random.key(1), i))
+
+        model = learned.init(SPEC, jax.random.key(0), STATES, ACTIONS)
+        model = jax.lax.fori_loop(0, chunks, once, model)
+        return model, learned.read(SPEC, model, jnp.eye(STATES), ACTIONS, RATERS)
+
+    return jax.jit(fit)
+
+
+@cache
+def read_after(chunks: int, what: str = "all") -> tuple[Model, Feedback]:
+    slots = {"all": np.ones(len(HALF), bool), "half": HALF, "none": np.zeros(len(HALF), bool)}[what]
+    return jax.tree.map(np.asarray, fitted()(WORLD, rated_world(slots), chunks))
+
+
+def error(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sqrt(np.mean((np.asarray(a) - np.asarray(b)) ** 2)))
+
+
+def test_predictions_approach_what_the_panel_says():
+    centre = np.asarray(WORLD.said.centre)
+    truth = centre.mean(-1), centre.min(-1), centre.std(-1), WORLD.task.reward
+    _, early = read_after(5)
+    _, late = read_after(200)
+    for name, expected in zip(("mean", "lowest", "spread", "proxy"), truth, strict=True):
+        before, after = error(getattr(early, name), expected), error(getattr(late, name), expected)
+        unit = float(np.std(WORLD.task.reward))
+        assert after < 0.15 * unit, name
+        assert after < 0.5 * before, name
+    hack = np.asarray(WORLD.truth.hack)
+    assert late.spread[hack].min() > 0.5 > 0.2 > np.quantile(late.spread[~hack], 0.95)
+    assert (late.spread >= 0).all()
+    assert late.raters == RATERS
+
+
+def test_count_says_where_ratings_were_heard():
+    _, feedback = read_after(200, "half")
+    count = feedback.count.reshape(-1)
+    yes, no = count[HALF], count[~HALF]
+    assert (yes[:, None] > no[None, :]).mean() > 0.99
+    assert np.median(no) < 0.5 < 5 < np.median(yes)
+    assert (count >= 0).all()
+
+
+def test_before_the_first_rating_nothing_is_fitted():
+    fresh, quiet = read_after(0, "none"), read_after(5, "none")
+    jax.tree.map(np.testing.assert_array_equal, quiet[0].layers, fresh[0].layers)
+    jax.tree.map(np.testing.assert_array_equal, quiet[0].optimiser, fresh[0].optimiser)
+    jax.tree.map(np.testing.assert_array_equal, quiet[1], fresh[1])
+    assert np.median(fresh[1].count) < 0.3
+
+
+def test_priors_are_never_fitted():
+    fresh, late = read_after(0, "none")[0], read_after(200)[0]
+    jax.tree.map(np.testing.assert_array_equal, fresh.prior, late.prior)
+
+
+@pytest.mark.parametrize("chunks", [0, 5, 200])
+@pytest.mark.parametrize("what", ["none", "half", "all"])
+def test_nothing_is_ever_nan(what: str, chunks: int):
+    for leaf in jax.tree.leaves(read_after(chunks, what)):
+        assert np.isfinite(leaf).all()
+
+
+def test_a_constant_reward_has_a_unit():
+    """One rated step: no deviation to measure in."""
+    one = np.arange(len(HALF)) == 17
+    model, feedback = jax.tree.map(np.asarray, fitted()(WORLD, rated_world(one), 200))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((model, feedback)))
+    np.testing.assert_array_equal(model.scale, 1.0)
+    assert abs(feedback.mean.reshape(-1)[17] - np.asarray(WORLD.said.centre).reshape(-1, RATERS)[17].mean()) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("members", 1),
+        ("hidden", 0),
+        ("learning_rate", 0.0),
+        ("fits", 0),
+        ("batch", 0),
+        ("prior_scale", 0.0),
+    ],
+)
+def test_what_is_refused(field: str, value: Any):
+    with pytest.raises(InvalidValueError, match=f"^{field} = "):
+        RatingModel(**{field: value})
