@@ -54,6 +54,8 @@ class Run:
     """The same as a fraction of the trap's reward (instead of --noise)."""
     rated: float = 1.0
     """Fraction of steps that are rated."""
+    feedback: str | None = None
+    """How a deep agent knows of ratings: model (learned; what is taken if left out) or table (running means)."""
     episodes: int = 500
     """Training episodes."""
     seeds: int = 10
@@ -161,19 +163,26 @@ def _run(command: Run, console: Console) -> None:
     _check_json(command.json)
     environment = names.environment(command.environment, names.settings(command.set))
     noise = command.noise
+    trap_reward = getattr(environment, "trap_reward", 0.0)
     if command.noise_fraction is not None:
         _checks.number("noise_fraction", command.noise_fraction, low=0)
+        if not trap_reward:
+            raise _checks.InvalidValueError(
+                "noise_fraction", command.noise_fraction, "left out where no trap pays; see --noise"
+            )
         if noise:
             raise _checks.InvalidValueError("noise", noise, "left out when --noise-fraction is given")
-        noise = command.noise_fraction * abs(environment.trap_reward)
+        noise = command.noise_fraction * abs(trap_reward)
+    agent = names.agent(command.agent, names.settings(command.set_agent, "--set-agent"))
     cell = Cell(
         environment,
         names.mitigation_named(command.mitigation, names.settings(command.set_mitigation, "--set-mitigation")),
-        names.agent(command.agent, names.settings(command.set_agent, "--set-agent")),
+        agent,
         command.panel,
         noise,
         command.rated,
         command.episodes,
+        feedback=names.feedback(command.feedback, agent),
     )
     store = Store(command.store or ":memory:")
     seeds = range(command.seeds)
@@ -187,7 +196,7 @@ def _run(command: Run, console: Console) -> None:
         "metrics": {name: s._asdict() for name, s in metrics.items()},
         "steps_per_second": round(steps / seconds) if trained == len(seeds) else None,
         "steps": steps,
-        "noise_as_fraction_of_trap_reward": noise / abs(environment.trap_reward) if environment.trap_reward else None,
+        "noise_as_fraction_of_trap_reward": noise / abs(trap_reward) if trap_reward else None,
         "seeds": list(seeds),
         "config": cell.config(),
         "key": cell.key,

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from uard.agents.actor_critic import SoftActorCritic
 from uard.agents.off_policy import Batch, Watched
 from uard.agents.value import DeepQ
 from uard.envs.tabular import HiddenTruth, Ratings, Task
@@ -117,10 +116,9 @@ def test_lanes_in_one_batch_are_the_lanes_alone():
 
 def test_side_by_side_gives_the_same():
     pair = [chain(), chain(seed=1, gamma=0.5)]
-    short = Program(episodes=200, steps=256, walk=8)
     stacked = jax.tree.map(lambda *x: np.stack([np.asarray(v, lanes.narrow(v)) for v in x]), *pair)
-    together = jax.jit(jax.vmap(lambda one: off_policy.run(one, short)))(stacked)
-    for i, alone in enumerate(lanes.train(pair, off_policy.run, short, ("log", "values", "steps"), ROOM)):
+    together = jax.jit(jax.vmap(lambda one: off_policy.run(one, PROGRAM)))(stacked)
+    for i, alone in enumerate(train(*pair)):
         np.testing.assert_array_equal(together.steps[i], alone["steps"])
         np.testing.assert_allclose(together.log[i], alone["log"], rtol=1e-4, atol=1e-4)
         for one, other in zip(together.values, alone["values"], strict=True):
@@ -143,8 +141,31 @@ def test_a_reward_beyond_measure_is_noticed_and_harms_no_other_lane(bad: float):
 def test_the_cause_is_named_before_its_effects():
     endless = probe([[0, 0]], [[1.0, np.nan]], [[False, False]], 10_000)
     assert QUANTITIES[train(endless)[0]["fault"]] == "reward"
-    growing = probe([[0, 0]], [[1e20, 1e20]], [[False, False]], 10_000, gamma=0.9)
-    assert QUANTITIES[train(growing)[0]["fault"]] == "values"
+    episodic = probe([[0, 0]], [[1.0, np.nan]], [[True, True]], 9)
+    assert QUANTITIES[train(episodic)[0]["fault"]] == "loss", "an episode's sums are over before one looks"
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("nothing", {}),
+        ("loss", {"loss": np.inf, "largest": np.nan, "agent": np.nan}),
+        ("values", {"largest": 3e8, "agent": np.nan}),
+        ("values", {"largest": np.nan}),
+        ("parameters", {"agent": np.nan}),
+        ("rating model", {"model": np.inf, "loss": np.nan}),
+        ("reward", {"reward": np.nan, "model": np.nan, "loss": np.nan, "largest": np.nan, "agent": np.nan}),
+    ],
+)
+def test_what_diverged_is_named(name: str, changes: dict[str, float]):
+    fine = {"agent": 1.0, "loss": 1.0, "largest": 1e8, "model": 0.0, "reward": 1.0}
+    seen = {k: jnp.float32(v) for k, v in (fine | changes).items()}
+    before = deep.Watch.start(jnp.float32(7.0))
+    watch = before.after(jnp.int32(128), **seen, unit=jnp.float32(2.0))
+    assert QUANTITIES[int(watch.fault)] == name
+    well = name == "nothing"
+    assert (int(watch.fault_step), int(watch.good_step)) == ((0, 128) if well else (128, 0))
+    assert float(watch.good) == (1.0 if well else 7.0)
 
 
 def one_way(agent: Any, seed: int = 0) -> Lane:
@@ -156,18 +177,18 @@ def one_way(agent: Any, seed: int = 0) -> Lane:
 def test_no_agent_shifts_the_ratings():
     """Ratings have a stream of their own: agents that draw otherwise hear the same."""
     program = Program(episodes=100, steps=256, walk=4)
-    actor = SoftActorCritic(network=NETWORK, buffer=1000, batch=32, warmup=64)
+    learner = random_walker(ensemble=SINGLE)
     heard = {}
     for name, lane in {
-        "value": one_way(random_walker()),
-        "actor": one_way(actor),
-        "other seed": one_way(actor, 1),
+        "learner": one_way(learner),
+        "witness": one_way(Witness()),
+        "other seed": one_way(learner, 1),
     }.items():
         (out,) = lanes.train([lane], off_policy.run, program, ("feedback", "values"), ROOM)
         heard[name] = np.stack(out["feedback"][:5])
-    np.testing.assert_array_equal(heard["value"], heard["actor"])
-    assert (heard["actor"] != heard["other seed"]).any()
-    count = heard["value"][0]
+    np.testing.assert_array_equal(heard["learner"], heard["witness"])
+    assert (heard["learner"] != heard["other seed"]).any()
+    count = heard["learner"][0]
     assert 0.5 * 256 < count.sum() < 0.9 * 256
 
 
@@ -197,7 +218,7 @@ class Witness:
         return Seen(jnp.int32(0), first, jnp.zeros((features, actions)))
 
     def values(self, state: Seen, observations: Any, key: Any) -> Any:
-        return jnp.broadcast_to(state.ever.T[None, :1], (2, observations.shape[0], state.ever.shape[1])) * 0.0
+        return jnp.zeros((2, observations.shape[0], state.ever.shape[1]))
 
     def read(self, state: Seen, observations: Any, key: Any) -> Any:
         return self.values(state, observations, key)[0], self.values(state, observations, key)[1]
@@ -217,7 +238,7 @@ class Witness:
 @cache
 def witnessed() -> Any:
     steps = world([[1, 1], [2, 2], [0, 0]], [[1, 1]] * 3, [[False] * 2, [False] * 2, [True] * 2], 9)
-    (lane,) = [deep.lane(steps, Witness(), named("raw"), 0)]  # type: ignore[arg-type]
+    lane = deep.lane(steps, Witness(), named("raw"), 0)
     lane = jax.tree.map(lambda x: np.asarray(x, lanes.narrow(x)), lane)
     return jax.jit(lambda one: off_policy.run(one, Program(episodes=100, steps=256, walk=4))).lower(
         lane
@@ -263,9 +284,3 @@ def test_the_buffer_is_never_copied_within_a_chunk():
     assert writes
     deepest = max(map(depth, writes))
     assert all(depth(name) < deepest for name in copies)
-
-
-def test_a_single_network_trains_too():
-    (out,) = train(bandit(ensemble=SINGLE))
-    np.testing.assert_allclose(mean(out)[0], [1.5, -2.0], atol=0.05)
-    assert not out["values"][1].any()

@@ -229,13 +229,13 @@ def test_fisher_product_is_the_fisher_matrix():
 
     # By its definition: the mean, over states and the policy's own actions, of the score's outer product.
     p = np.asarray(jax.nn.softmax(logits_of(theta)), np.float64)
-    score = np.asarray(jax.jacobian(lambda t: jax.nn.log_softmax(logits_of(t)))(theta), np.float64)
+    score = np.asarray(jax.jit(jax.jacobian(lambda t: jax.nn.log_softmax(logits_of(t))))(theta), np.float64)
     fisher = np.einsum("ba,bai,baj->ij", p, score, score) / BATCH
     product = policy.fisher_product(logits_of, theta, 0.1)
-    got = jax.vmap(product)(jnp.eye(theta.size))
+    got = jax.jit(jax.vmap(product))(jnp.eye(theta.size))
     np.testing.assert_allclose(got, fisher + 0.1 * np.eye(theta.size), atol=2e-6)
     # And it is the curvature of the divergence.
-    curvature = jax.hessian(lambda t: policy.divergence(logits_of(theta), logits_of(t)))(theta)
+    curvature = jax.jit(jax.hessian(lambda t: policy.divergence(logits_of(theta), logits_of(t))))(theta)
     np.testing.assert_allclose(curvature, fisher, atol=1e-5)
 
 

@@ -157,6 +157,13 @@ def agent(name: str, changes: dict[str, Any]) -> Agent:
     return changed(base, changes, "agent")
 
 
+def feedback(name: str | None, of: Agent) -> RatingModel | None:
+    """Return how an agent knows of ratings: ``model`` (a deep agent's default) or ``table`` (a tabular one's)."""
+    if name is None:
+        return None if isinstance(of, QLearning) else RatingModel()
+    return RatingModel() if _checks.choose("feedback", name, ("model", "table")) == "model" else None
+
+
 def mitigation_named(name: str, changes: dict[str, Any]) -> Mitigation:
     """Return a mitigation by name, some fields changed (``filter.lam`` and the like for the filter's)."""
     base: Any = mitigation.named(name)
