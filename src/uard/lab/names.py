@@ -18,6 +18,7 @@ from uard.envs.gaming import AbsentSupervisor, BoatRace, TomatoWatering
 from uard.envs.panels import PANELS
 from uard.envs.spec import Tables
 from uard.envs.trapgrid import TrapGrid
+from uard.feedback.learned import RatingModel
 from uard.mitigation import Mitigation
 from uard.networks import Ensemble, Network
 
