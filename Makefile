@@ -19,6 +19,7 @@ test: $(VENV)/.test
 
 bench: $(VENV)/.test
 	$(BIN)/python benchmarks/tabular.py
+	$(BIN)/python benchmarks/deep.py
 
 docs: $(VENV)/.test
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
@@ -33,10 +34,11 @@ $(VENV)/.lab: requirements/lab.txt pyproject.toml | $(VENV)/bin/python
 	@touch $@
 
 # torch first and pinned: a CPU build, where one is at hand, must not be replaced by a newer CUDA build.
-$(VENV)/.test: $(VENV)/.lab requirements/test.txt requirements/torch.txt
+$(VENV)/.test: $(VENV)/.lab requirements/test.txt requirements/torch.txt requirements/sb3.txt
 	@echo "Installing what the tests need ..."
 	$(PIP) install -r requirements/torch.txt
 	$(PIP) install -r requirements/test.txt
+	$(PIP) install --no-deps -r requirements/sb3.txt
 	@touch $@
 
 lock: $(VENV)/bin/python

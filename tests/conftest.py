@@ -16,7 +16,10 @@ import pytest
 import torch
 from hypothesis import settings
 
+from uard.training.xla import keep_programs
+
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+keep_programs()  # so that processes of a test run, and the next run, need not compile the same again
 
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=100)
 settings.register_profile("explore", deadline=None, max_examples=2000)

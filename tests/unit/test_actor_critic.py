@@ -246,7 +246,7 @@ def test_the_actor_climbs_the_mitigations_scores_here():
 def test_repeated_updates_learn_values_and_policy():
     learner = agent(**SETTINGS["edac"] | {"temperature": 0.02})
     state, some = begun(learner), batch(3, terminated=[True] * 4)
-    for _ in range(300):
+    for _ in range(1000):
         state, _ = step(learner)(state, some, [1, 1, 0, 1])
     q = np.asarray(learner.values(state, some.observation))
     np.testing.assert_allclose(q[:, ROWS, some.action][:, [0, 1, 3]], np.tile(REWARD[[0, 1, 3]], (3, 1)), atol=0.3)

@@ -115,6 +115,13 @@ def _losses(e: Evidence) -> list[str]:
         f"settings with honest raters and noise up to sd 1.2, uard misses 0.2 visits (0.15 without noise) or 98 % goals in "
         f"{len(target)}{': ' + '; '.join(_name(r) for r in target) if target else ''}."
     )
+    learned = [r for r in e.studies["sources"].where(mitigation="uard", sources="sigma_m and sigma_h")]
+    fooled = [r for r in learned if e.of(r.cell, "trap_visits").mean > 1 or e.of(r.cell, "goal_rate").mean < 0.95]
+    out.append(
+        f"A reward that is itself a model of ratings (study sources): uard as recommended fails for {len(fooled)} of "
+        f"{len(learned)} models: it believes a tenth of what nobody has rated, and their extrapolation is large enough for "
+        "that. A plain filter with both sources and a large constant lambda does not (table below)."
+    )
     for study, shown in (("matrix", ("size", "trap", "panel", "noise")), ("budgets", ("panel", "noise", "rated"))):
         beaten = []
         rows = [r for r in e.studies[study].where(mitigation="uard") if r["panel"] != "colluding"]
