@@ -55,7 +55,7 @@ def test_help(command, says):
 def test_list_names_everything():
     done = uard("list")
     listed = {line.split()[0] for line in done.stdout.splitlines() if line.strip()}
-    known = {*names.ENVIRONMENTS, *names.AGENTS, *mitigation.NAMED, *PANELS, *(s.name for s in studies.grid())}
+    known = {*names.ENVIRONMENTS, *names.AGENTS, *mitigation.NAMED, *PANELS, *(s.name for s in studies.every())}
     assert (done.returncode, done.stderr) == (0, "")
     assert known - listed == set()
 
@@ -97,6 +97,15 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
         ("run TrapGird", "environment = 'TrapGird': must be one of *did you mean 'TrapGrid'?"),
         ("run --agent qlearning", "agent = 'qlearning': must be one of *did you mean 'q-learning'?"),
         ("run --mitigation urad", "mitigation = 'urad': must be one of *did you mean 'uard'?"),
+        (
+            "run TomatoWatering",
+            "agent = QLearning(*does not fit into tables: dqn, ensemble-dqn",
+        ),
+        ("run BoatRace --noise-fraction 0.3", "noise_fraction = 0.3: must be left out where no trap pays"),
+        ("run --agent dqn --feedback tabel", "feedback = 'tabel': must be one of *did you mean 'table'?"),
+        ("run --feedback model", "feedback = RatingModel(*none for a tabular agent"),
+        ("run --agent dqn --set-agent batch=0", "batch = 0: must be a whole number in [1, 4096]"),
+        ("reproduce grid-dep", "study = 'grid-dep': must be one of *did you mean 'grid-deep'?"),
         ("run --panel mian", "panel = 'mian': must be one of *did you mean 'main'?"),
         ("run --set sise=5", "environment setting = 'sise': must be one of *did you mean 'size'?"),
         ("run --set-mitigation lamda=5", "mitigation setting = 'lamda': must be one of *did you mean 'lam'?"),

@@ -149,7 +149,7 @@ def finish(cell: Cell, task: Task, truth: HiddenTruth, raters: int, out: dict[st
     """Turn a trained lane into a result: greedy path, calibration, curves of both uncertainties."""
     states = task.next_state.shape[0]
     if not (np.isfinite(out["log"]).all() and np.isfinite(out["q"]).all()):
-        raise DivergedError(f"training diverged: NaN or infinity in the values or the log of {cell}", cell.key)
+        raise FloatingPointError(f"training diverged: NaN or infinity in the values or the log of {cell}")
     feedback = read_feedback(out["feedback"][:states], raters)
     extra: dict[str, np.ndarray] = {}
     if cell.mitigation.reads_feedback:

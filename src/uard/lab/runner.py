@@ -183,6 +183,8 @@ def _kept(answer: Result | DivergedError | str, store: Store) -> Result | str:
     """Write down the last good state of a run that diverged; what is returned says where it is."""
     if not isinstance(answer, DivergedError):
         return answer
+    if not answer.good:
+        return str(answer)
     folder = Path("uard-diverged" if store.path == ":memory:" else f"{store.path}-diverged")
     file = folder / f"{answer.name}.npz"
     try:
