@@ -121,6 +121,11 @@ class Published:
             if f["results"] == RESULTS:
                 self._cells |= f["cells"]
 
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """Return the keys of all published cells."""
+        return tuple(self._cells)
+
     def has(self, row: Row) -> bool:
         """Whether a row was published."""
         return row.cell.key in self._cells
