@@ -115,8 +115,9 @@ def matched(p: Published) -> list[str]:
             own = p.of(mine[0], "true_return")
             better = [r for r in equals if p.of(r, "true_return").ci95[0] > own.ci95[1]]
             higher = [r for r in equals if p.of(r, "true_return").mean > own.mean and r not in better]
-            names = ", ".join(r["mitigation"] for r in equals) or "nobody"
-            text = f"{agent}, {panel} panel, very noisy raters: matched in hack rate: {names}; uard's true return {full(own)}"
+            names = ", ".join(r["mitigation"] for r in equals)
+            rivals = f"matched in hack rate by {names}" if names else "no rival hacks as rarely"
+            text = f"{agent}, {panel} panel, very noisy raters: {rivals}; uard's true return {full(own)}"
             if better:
                 text += "; it is beaten by " + ", ".join(
                     f"{r['mitigation']} {full(p.of(r, 'true_return'))}" for r in better
@@ -143,6 +144,14 @@ def losses(p: Published) -> list[str]:
         text = f"Deep agents on 10x10: of {len(p.rows('deep-uard'))} settings uard misses 0.5 visits or 95 % goals in {len(missed)}"
         out.append(text + (": " + "; ".join(missed) if missed else "") + ".")
     out += matched(p)
+    for r in p.rows("deep-feedback", source="table"):
+        for model in p.rows("deep-feedback", source="model", rated=r["rated"]):
+            table, learned = p.of(r, "true_return"), p.of(model, "true_return")
+            if table.ci95[0] > learned.ci95[1]:
+                out.append(
+                    f"With {100 * r['rated']:g} % of steps rated, the learned model of the ratings does worse than a table of running "
+                    f"means: {full(learned)} against {full(table)}. Here it extrapolates what few ratings do not support."
+                )
     games = p.rows("gaming", mitigation="uard")
     beaten = []
     for r in games:

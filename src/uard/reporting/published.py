@@ -34,12 +34,14 @@ FILES = ("grid-deep.json", "games.json")
 
 def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], command: str) -> dict[str, Any]:
     """Gather what the report needs of the finished rows of some studies, as plain data."""
-    cells: dict[str, Any] = {}
+    wanted: dict[Cell, set[str]] = {}
     for study in studies:
         for r in study.rows:
-            found = store.get(r.cell, seeds)
-            if found and r.cell.key not in cells:
-                cells[r.cell.key] = _of_cell(study.name, r.cell, found)
+            wanted.setdefault(r.cell, set()).add(study.name)
+    cells: dict[str, Any] = {}
+    for cell, names in wanted.items():
+        if found := store.get(cell, seeds):
+            cells[cell.key] = _of_cell(names, cell, found)
     return {
         "command": command,
         "version": __version__,
@@ -50,7 +52,7 @@ def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], comman
     }
 
 
-def _of_cell(study: str, cell: Cell, found: dict[int, Result]) -> dict[str, Any]:
+def _of_cell(studies: set[str], cell: Cell, found: dict[int, Result]) -> dict[str, Any]:
     results = [found[s] for s in sorted(found)]
     metrics = [r.metrics() for r in results]
     out: dict[str, Any] = {
@@ -58,15 +60,15 @@ def _of_cell(study: str, cell: Cell, found: dict[int, Result]) -> dict[str, Any]
         "seeds": sorted(found),
         "metrics": {m: [_short(x[m]) for x in metrics] for m in metrics[0]},
     }
-    if study == "deep-baselines":
+    if "deep-baselines" in studies:
         out["curves"] = {c: [[_short(x) for x in _binned(r.curve(c))] for r in results] for c in CURVES}
     derived: dict[str, list[Any]] = {}
     for name in ("calibration", "rating_error"):
         if name in results[0].extra:
             derived[name] = [[_short(x) for x in r.extra[name]] for r in results]
-    if study == "deep-ensembles":
+    if "deep-ensembles" in studies:
         derived["sigma_m"] = [[_short(x) for x in sigma_quality(cell, r)] for r in results]
-    if study == "deep-distortion":
+    if "deep-distortion" in studies:
         traces = [distortion.walk(cell, r, s) for s, r in sorted(found.items())]
         derived["activations"] = [distortion.activations(t) for t in traces]
         derived["largest"] = [_short(t.adjusted[t.counts].max()) for t in traces]
