@@ -182,3 +182,9 @@ def test_a_learned_reward_is_right_where_it_was_rated_and_in_doubt_elsewhere():
 def test_bad_learned_rewards_are_refused(field, value):
     with pytest.raises(InvalidValueError, match=f"{field} = "):
         LearnedRewardGrid(**{field: value})
+
+
+def test_grids_with_a_doubtful_reward_are_batched_apart():
+    cells = [Cell(TrapGrid(size=10), named("uard"), episodes=2), Cell(LearnedRewardGrid(), named("uard"), episodes=2)]
+    store = Store(":memory:")
+    assert runner.run([(c, s) for c in cells for s in range(2)], store, workers=1) == 4

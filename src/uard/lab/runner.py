@@ -62,7 +62,7 @@ def shape_of(cell: Cell) -> tuple[Any, ...]:
 
     agent, mitigation = structure(plain(cell.agent)), structure(plain(cell.mitigation))
     if isinstance(cell.environment, Tables):
-        where: Any = max(MIN_STATES, cell.environment.states)
+        where: Any = type(cell.environment).__name__, max(MIN_STATES, cell.environment.states)
     else:
         where = structure(plain(cell.environment))
     raters = 1 if cell.panel == "single" else 3
