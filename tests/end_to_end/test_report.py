@@ -110,7 +110,7 @@ def test_every_link_leads_somewhere_and_every_image_is_there(page):
     assert len(targets) > 5
     assert [t for t in targets if page.locator(t).count() != 1] == []
     images = page.eval_on_selector_all("img", "all => all.map(i => [i.alt, i.complete, i.naturalWidth])")
-    assert len(images) == 12
+    assert len(images) >= 12, "the deep figures come with their published results"
     assert [i for i in images if not (i[0] and i[1] and i[2] > 0)] == []
 
 

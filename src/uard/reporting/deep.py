@@ -332,7 +332,8 @@ def _curves(p: Published) -> Figure:
             label = r["agent"] if raw else f"{r['agent']} + {r['mitigation']}"
             colour = COLOURS[r["agent"]] if raw else figures.COLOURS[r["mitigation"]]
             x = (np.arange(len(curve)) + 1) * BIN
-            axis.plot(x, curve, color=colour, lw=1.6 if raw else 2.4, ls="-" if raw else "--", label=label)
+            style = "-" if raw else ":" if r["agent"] == "ppo" else "--"
+            axis.plot(x, curve, color=colour, lw=1.6 if raw else 2.4, ls=style, label=label)
         axis.set(xlabel="episode", ylabel=column.replace("_", " "))
     axes[1].legend(fontsize=8, ncols=2)
     return figure
