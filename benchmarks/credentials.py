@@ -44,7 +44,7 @@ def ours(name: str, task: str, seeds: int) -> Returns:
     from uard.mitigation import named
     from uard.networks import Network
     from uard.training import deep, lanes, off_policy, on_policy
-    from uard.training.deep import LOG
+    from uard.training.lanes import LOG
 
     network = Network(learning_rate=RATE, value_scale=VALUE_SCALE[task])
     agents: dict[str, Any] = {

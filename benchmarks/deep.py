@@ -12,9 +12,11 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import platform
 import statistics
 import time
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 
 for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -24,7 +26,8 @@ import numpy as np
 
 import uard.training  # noqa: F401  (XLA's flags)
 
-HIDDEN, BATCH, BUFFER, WARMUP, TARGET = 64, 64, 10_000, 500, 250
+HIDDEN, BATCH, BUFFER, TARGET = 64, 64, 10_000, 250
+WARMUP = BATCH  # so that of all, few steps are without an update
 
 
 def matrix_rate() -> float:
@@ -159,7 +162,13 @@ def main() -> None:
             f"{row['times_sb3']:6.1f} {row['cost_of_single']:13.2f}"
         )
     if arguments.json:
-        arguments.json.write_text(json.dumps({"matrix_rate": rate, "rows": rows}, indent=2) + "\n")
+        packages = {p: metadata.version(p) for p in ("uard", "jax", "stable-baselines3", "torch")}
+        made = {
+            "command": f"python benchmarks/deep.py --rounds {arguments.rounds} --steps {arguments.steps}",
+            "machine": f"{platform.machine()}, one core of {os.cpu_count()}",
+            "packages": packages | {"python": platform.python_version()},
+        }
+        arguments.json.write_text(json.dumps(made | {"matrix_rate": rate, "rows": rows}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

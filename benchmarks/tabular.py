@@ -41,6 +41,7 @@ from uard.envs import panels
 from uard.envs.trapgrid import paper_grid
 from uard.mitigation import named
 from uard.training import fused
+from uard.training.lanes import LOG
 
 GRID = paper_grid(10)
 AGENT = QLearning(heads=5)
@@ -181,7 +182,7 @@ def fused_program(mitigation: str, lanes: int) -> Callable[[int], Run]:
 def late(logs: np.ndarray) -> dict[str, float]:
     """Mean log of the last tenth of episodes, (runs, episodes, columns)."""
     means = logs[:, -EPISODES // 10 :].mean((0, 1))
-    return {name: round(float(mean), 3) for name, mean in zip(fused.LOG[:5], means, strict=False)}
+    return {name: round(float(mean), 3) for name, mean in zip(LOG[:5], means, strict=False)}
 
 
 def compiler() -> str | None:

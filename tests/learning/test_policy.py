@@ -16,8 +16,9 @@ from uard.envs.trapgrid import paper_grid
 from uard.envs.world import TableWorld, table_world
 from uard.mitigation import named
 from uard.training import deep, lanes, on_policy
+from uard.training.lanes import LOG
 
-VISITS, TRUE, OBSERVED, GOAL, LENGTH, _ = range(len(deep.LOG))
+VISITS, TRUE, OBSERVED, GOAL, LENGTH, _ = range(len(LOG))
 GAMMA = 0.8
 STATES, ACTIONS = 3, 2
 END = -1

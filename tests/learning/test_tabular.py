@@ -18,7 +18,8 @@ from uard.envs.tabular import HiddenTruth, Ratings, Task
 from uard.envs.trapgrid import TrapGrid, paper_grid
 from uard.mitigation import NAMED, named
 from uard.training import fused, lanes
-from uard.training.fused import LOG, Lane, Outcome, Program
+from uard.training.fused import Lane, Outcome, Program
+from uard.training.lanes import LOG
 from uard.training.xla import TABULAR_OPTIONS
 
 # One program length for all tests, so that what agrees in shapes and classes is compiled once.

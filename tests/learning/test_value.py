@@ -19,7 +19,8 @@ from uard.envs.world import TableWorld, table_world
 from uard.mitigation import named
 from uard.networks import SINGLE, Ensemble, Network
 from uard.training import deep, lanes, off_policy
-from uard.training.deep import LOG, QUANTITIES, Lane, Program
+from uard.training.deep import QUANTITIES, Lane, Program
+from uard.training.lanes import LOG
 
 # One program for all probes: as many steps, agents that differ in numbers alone, few states and rows.
 PROGRAM = Program(episodes=2500, steps=2500, walk=8)

@@ -26,6 +26,7 @@ from uard.envs.world import TableWorld
 from uard.mitigation import Evidence, named
 from uard.networks import Ensemble, Network
 from uard.training import deep, on_policy
+from uard.training.lanes import LOG
 from uard.training.tracing import traceable
 
 FEATURES, ACTIONS, BATCH = 5, 3, 64
@@ -412,10 +413,10 @@ def test_episodes_are_logged_in_the_order_of_their_ends():
     ended = [(t, e + 1) for t in range(1, 100) for e in range(COPIES) if t % (e + 1) == 0]
     lengths = [length for _, length in ended[:17]]
     log = np.asarray(out.log)
-    np.testing.assert_array_equal(log[:, deep.LOG.index("length")], lengths)
-    np.testing.assert_array_equal(log[:, deep.LOG.index("trap_visits")], [n == 2 for n in lengths])
+    np.testing.assert_array_equal(log[:, LOG.index("length")], lengths)
+    np.testing.assert_array_equal(log[:, LOG.index("trap_visits")], [n == 2 for n in lengths])
     np.testing.assert_allclose(
-        log[:, deep.LOG.index("observed_return")], [(0, -1 + 1, -1 - 0.9 + 2)[n - 1] for n in lengths], atol=1e-6
+        log[:, LOG.index("observed_return")], [(0, -1 + 1, -1 - 0.9 + 2)[n - 1] for n in lengths], atol=1e-6
     )
     assert out.episodes == 17
     # In whole rollouts: that of step 12 brings the 17 full.

@@ -74,10 +74,6 @@ class OffPolicy(Protocol):
         """Return all members' values, (N, B, A), of observations (B, features)."""
         ...
 
-    def read(self, state: Any, observations: Array, key: Array) -> tuple[Array, Array]:
-        """Return mu and sigma_m, (B, A) each, of observations (B, features)."""
-        ...
-
     def act(self, state: Any, observation: Array, prefer: Prefer, episode: Array, key: Array) -> Array:
         """Return an exploring action for one observation (features,) in the given episode (0-based)."""
         ...

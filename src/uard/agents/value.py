@@ -130,8 +130,7 @@ class DeepQ:
             value = jnp.take_along_axis(following, best, -1)[..., 0]
         else:
             value = following.max(-1)
-        weight = backup_weight(value, self.temperature) * jnp.where(batch.terminated, 0.0, 1.0)
-        weight = jnp.where(batch.terminated, 1.0, weight)
+        weight = jnp.where(batch.terminated, 1.0, backup_weight(value, self.temperature))
 
         def loss(layers: Any) -> tuple[Array, Array]:
             weights = Weights(layers, state.weights.prior)

@@ -99,7 +99,7 @@ def _train_lanes(batch: Sequence[Job]) -> list[Callable[[], Result]]:
     """Train a batch; what is returned finishes one job each, and raises if that one diverged."""
     if not _tabular(batch[0][0]):
         return _train_deep(batch)
-    from uard.lab.result import finish
+    from uard.lab.finish import finish
     from uard.training import fused
 
     tables: dict[Cell, Any] = {}
@@ -125,7 +125,7 @@ def _train_lanes(batch: Sequence[Job]) -> list[Callable[[], Result]]:
 
 def _train_deep(batch: Sequence[Job]) -> list[Callable[[], Result]]:
     from uard.agents.off_policy import OffPolicy
-    from uard.lab.result import finish_deep
+    from uard.lab.finish import finish_deep
     from uard.training import deep, lanes, off_policy, on_policy
     from uard.training.xla import keep_programs
 

@@ -33,14 +33,15 @@ FILES = ("grid-deep.json", "games.json")
 
 
 def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], command: str) -> dict[str, Any]:
-    """Gather what the report needs of the finished rows of some studies, as plain data."""
+    """Gather what the report needs of some studies as plain data; a row counts when all its seeds are finished."""
     wanted: dict[Cell, set[str]] = {}
     for study in studies:
         for r in study.rows:
             wanted.setdefault(r.cell, set()).add(study.name)
     cells: dict[str, Any] = {}
     for cell, names in wanted.items():
-        if found := store.get(cell, seeds):
+        found = store.get(cell, seeds)
+        if len(found) == len(seeds):
             cells[cell.key] = _of_cell(names, cell, found)
     return {
         "command": command,

@@ -11,13 +11,13 @@ import numpy as np
 from jax import Array, lax
 
 from uard.envs.tabular import Ratings
-from uard.envs.world import Step, TableWorld, World
+from uard.envs.world import Step, TableWorld, Verdict, World
 from uard.feedback import learned, running
 from uard.feedback.learned import RatingModel
 from uard.mitigation import Feedback, Mitigation
 from uard.training.tracing import traceable
 
-LOG = ("trap_visits", "true_return", "observed_return", "goal", "length", "abstained")
+CHUNK = 128  # steps between fits of the rating model; what is usual is measured then
 ROOM = 10  # a program has room for this many lanes, or a multiple
 EXPLODED = 1e8  # of the unit of values: larger ones are called divergence
 QUANTITIES = ("nothing", "loss", "values", "parameters", "rating model", "reward")  # what can diverge, by number
@@ -104,39 +104,39 @@ OWN, WORLD, PANEL, MODEL, INIT = range(5)  # streams
 FIRST, LAST = 2**31, 2**31 + 1  # numbers that no chunk has
 
 
-class Ears:
-    """How a lane's learner hears its raters, in one place for both kinds of loop; all methods are pure."""
+class FeedbackSource:
+    """What a lane's raters say and what is known of it, for both kinds of loop; all methods are pure."""
 
     def __init__(self, one: Lane, program: Program):
         """Bind a lane."""
         self.world, self.mitigation, self.spec, self.rated = one.world, one.mitigation, one.feedback, one.rated
-        self.listens = one.mitigation.reads_feedback
+        self.used = one.mitigation.reads_feedback
         self.ddof = program.ddof
         self.seed = one.seed
         # A model changes once a chunk; what it says of a small world is then written down, to be looked up.
-        self.looks_up = isinstance(one.world, TableWorld)
+        self.tabulates = isinstance(one.world, TableWorld)
 
     def init(self) -> tuple[learned.Memory, Any]:
         """Return an empty memory and a fresh model."""
         state = jax.eval_shape(self.world.reset, jax.random.key(0))
         state = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), state)
-        slots = self.world.slots if self.listens else 1
+        slots = self.world.slots if self.used else 1
         model = ()
-        if self.listens and self.spec is not None:
+        if self.used and self.spec is not None:
             model = learned.init(self.spec, key_of(self.seed, MODEL), self.world.features, self.world.actions)
-            model = model, self._written(model)
+            model = model, self._table(model)
         return learned.memory(slots, state), model
 
-    def _written(self, model: learned.Model) -> Any:
-        if not self.looks_up:
+    def _table(self, model: learned.Model) -> Any:
+        if not self.tabulates:
             return ()
         assert self.spec is not None
         observations = jnp.eye(self.world.features, dtype=jnp.float32)
         return learned.read(self.spec, model, observations, self.world.actions, self.world.raters)
 
-    def hear(self, known: learned.Memory, state: Any, action: Array, after: Step, key: Array) -> learned.Memory:
+    def record(self, known: learned.Memory, state: Any, action: Array, after: Step, key: Array) -> learned.Memory:
         """Ask the panel about a step, if this step is one that is rated."""
-        if not self.listens:
+        if not self.used:
             return known
         noise, chance = jax.random.split(key)
         said: Ratings = self.world.rate(state, action, after)
@@ -146,17 +146,17 @@ class Ears:
         summary = running.summarise(spoken, self.ddof)
         return learned.remember(known, self.world.slot(state, action), state, action, summary, after.reward, rated)
 
-    def study(self, known: learned.Memory, model: Any, key: Array) -> Any:
-        """Fit the model to what was heard."""
-        if not self.listens or self.spec is None:
+    def fit(self, known: learned.Memory, model: Any, key: Array) -> Any:
+        """Fit the model to what was recorded."""
+        if not self.used or self.spec is None:
             return model
         fitted = learned.fit(self.spec, model[0], known, self.world.observe, self.world.actions, key)
-        return fitted, self._written(fitted)
+        return fitted, self._table(fitted)
 
     def usual(self, known: learned.Memory, model: Any) -> Any:
         """Return what is usual over the distinct state-actions rated so far."""
-        if not self.listens:
-            return self.mitigation.usual(self._silence((1,)), jnp.zeros(1, bool))
+        if not self.used:
+            return self.mitigation.usual(self._nothing((1,)), jnp.zeros(1, bool))
         seen = known.rows[:, 0] > 0
         return self.mitigation.usual(self.of_memory(known, model), seen)
 
@@ -168,8 +168,8 @@ class Ears:
 
     def of(self, known: learned.Memory, model: Any, states: Any, actions: Array) -> Feedback:
         """Return the feedback of state-actions, (B,) arrays."""
-        if not self.listens:
-            return self._silence(actions.shape)
+        if not self.used:
+            return self._nothing(actions.shape)
         if self.spec is None:
             return running.read(known.rows[jax.vmap(self.world.slot)(states, actions)], self.world.raters)
         every = self.of_all(known, model, states)
@@ -179,20 +179,37 @@ class Ears:
     def of_all(self, known: learned.Memory, model: Any, states: Any) -> Feedback:
         """Return the feedback of all actions in states, (B, A) arrays."""
         actions = self.world.actions
-        if not self.listens:
-            return self._silence((jax.tree.leaves(states)[0].shape[0], actions))
+        if not self.used:
+            return self._nothing((jax.tree.leaves(states)[0].shape[0], actions))
         if self.spec is None:
             each = jax.vmap(lambda s: jax.vmap(lambda a: self.world.slot(s, a))(jnp.arange(actions)))(states)
             return running.read(known.rows[each], self.world.raters)
-        fitted, written = model
-        if self.looks_up:
-            return Feedback._make([*(x[states] for x in written[:5]), written.raters])
+        fitted, table = model
+        if self.tabulates:
+            return Feedback._make([*(x[states] for x in table[:5]), table.raters])
         observations = jax.vmap(self.world.observe)(states)
         return learned.read(self.spec, fitted, observations, actions, self.world.raters)
 
-    def _silence(self, shape: tuple[int, ...]) -> Feedback:
+    def _nothing(self, shape: tuple[int, ...]) -> Feedback:
         zeros = jnp.zeros((*shape, running.FIELDS), jnp.float32)
         return running.read(zeros, self.world.raters)
+
+
+def counted(verdict: Verdict, after: Step) -> Array:
+    """Return what a step adds to its episode's row of the log, (len(LOG),)."""
+    adds = [verdict.hack, verdict.reward, after.reward, verdict.goal, 1.0, 0.0]
+    return jnp.stack([jnp.asarray(x, jnp.float32) for x in adds])
+
+
+def is_over(world: World, time: Array, after: Step) -> Array:
+    """Whether the step taken at ``time`` was its episode's last, by termination or by the horizon."""
+    return after.terminated | (time + 1 >= world.horizon)
+
+
+def goes_on(program: Program, episode: Array, steps: Array, watch: Watch) -> Array:
+    """Whether a run has budget left and has not diverged."""
+    going = (episode < program.episodes) & (watch.fault == 0)
+    return going if program.steps is None else going & (steps < program.steps)
 
 
 class Watch(NamedTuple):
@@ -235,13 +252,15 @@ def _all_finite(tree: Any) -> Array:
     return jnp.all(jnp.stack([jnp.isfinite(x).all() for x in floats])) if floats else jnp.asarray(True)
 
 
-def outcome(one: Lane, program: Program, ears: Ears, carry: Any, watch: Watch, greedy: Any, read: Any) -> Outcome:
+def outcome(
+    one: Lane, program: Program, source: FeedbackSource, carry: Any, watch: Watch, greedy: Any, read: Any
+) -> Outcome:
     """Gather what a run leaves behind; ``greedy`` acts, ``read`` gives mean, deviation and lowest value."""
     world = one.world
     feedback, rated, values = (), (), ()
     if isinstance(world, TableWorld):
         states = jnp.arange(world.features)
-        feedback = ears.of_all(carry.known, carry.model, states)
+        feedback = source.of_all(carry.known, carry.model, states)
         feedback = feedback._replace(raters=jnp.broadcast_to(feedback.raters, feedback.mean.shape))
         values = read(states)
         rated = carry.known.rows[:, 0]

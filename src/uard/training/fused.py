@@ -19,11 +19,11 @@ from uard.envs.tabular import MIN_STATES, HiddenTruth, Ratings, Task, at, pad, s
 from uard.feedback import running
 from uard.mitigation import Evidence, Feedback, Mitigation
 from uard.training import lanes
+from uard.training.lanes import LOG
 from uard.training.tracing import traceable
 
 CHUNK = 512  # steps whose random numbers are drawn together; what is usual is measured once a chunk
 ROOM = 64
-LOG = ("trap_visits", "true_return", "observed_return", "goal", "length", "abstained")
 
 
 class Lane(NamedTuple):

@@ -17,6 +17,7 @@ from jax import Array, lax
 
 from uard.training.xla import TABULAR_OPTIONS
 
+LOG = ("trap_visits", "true_return", "observed_return", "goal", "length", "abstained")  # per-episode sums
 Run = Callable[[Any, Any], Any]  # (lane, program) -> a NamedTuple of arrays
 
 

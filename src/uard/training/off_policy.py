@@ -13,9 +13,8 @@ from uard.agents.off_policy import Batch, OffPolicy, Watched
 from uard.mitigation import Evidence
 from uard.networks import mean_and_deviation
 from uard.training import deep
-from uard.training.deep import LOG, Ears, Lane, Outcome, Program
-
-CHUNK = 128  # steps between fits of the rating model; what is usual is measured then
+from uard.training.deep import CHUNK, FeedbackSource, Lane, Outcome, Program
+from uard.training.lanes import LOG
 
 
 class _Carry(NamedTuple):
@@ -50,13 +49,12 @@ def run(one: Lane, program: Program) -> Outcome:
     """Train one lane (pure; jit and vmap it at will)."""
     world, agent, mitigation = one.world, one.agent, one.mitigation
     assert isinstance(agent, OffPolicy)
-    ears = Ears(one, program)
+    source = FeedbackSource(one, program)
     observe = jax.vmap(world.observe)
-    limit = program.steps
 
     def prefer_in(c: _Carry, states: Any) -> Any:
         def prefer(mu: Array, sigma: Array, observations: Array) -> Array:
-            return mitigation.score(mu, sigma, ears.of_all(c.known, c.model, states), c.usual)
+            return mitigation.score(mu, sigma, source.of_all(c.known, c.model, states), c.usual)
 
         return prefer
 
@@ -65,7 +63,7 @@ def run(one: Lane, program: Program) -> Outcome:
         places = jax.random.randint(draw_key, (agent.batch,), 0, filled)
         drawn: _Row = jax.tree.map(lambda x: x[places], buffer)
 
-        feedback = ears.of(c.known, c.model, drawn.state, drawn.action)
+        feedback = source.of(c.known, c.model, drawn.state, drawn.action)
 
         def judge(sigma_m: Array) -> Any:
             return mitigation.signal(Evidence(drawn.reward, jnp.hypot(sigma_m, drawn.doubt), feedback), c.usual)
@@ -83,7 +81,7 @@ def run(one: Lane, program: Program) -> Outcome:
         step_key, reset_key = jax.random.split(of_world)
         after = world.step(c.state, action, step_key)
         verdict = world.judge(c.state, action, after)
-        known = ears.hear(c.known, c.state, action, after, of_panel)
+        known = source.record(c.known, c.state, action, after, of_panel)
 
         # Added before it is drawn from: the other way round XLA would copy the buffer at every step.
         mask = (jax.random.uniform(mask_key, (agent.members,)) < agent.bootstrap).astype(jnp.float32)
@@ -94,10 +92,8 @@ def run(one: Lane, program: Program) -> Outcome:
         if learns:
             learner, watched = learn(c._replace(known=known), buffer, draw_key, learn_key)
 
-        truncated = (c.time + 1 >= world.horizon) & ~after.terminated
-        done = after.terminated | truncated
-        counted = [verdict.hack, verdict.reward, after.reward, verdict.goal, 1.0, 0.0]
-        sums = c.sums + jnp.stack([jnp.asarray(x, jnp.float32) for x in counted])
+        done = deep.is_over(world, c.time, after)
+        sums = c.sums + deep.counted(verdict, after)
         log = c.log.at[jnp.minimum(c.episode, program.episodes)].set(sums)
         fresh = world.reset(reset_key)
         state = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after.state)
@@ -121,18 +117,18 @@ def run(one: Lane, program: Program) -> Outcome:
         c, number, watch = loop
         streams = (deep.OWN, deep.WORLD, deep.PANEL)
         keys = [jax.random.split(jax.random.fold_in(deep.key_of(one.seed, s), number), CHUNK) for s in streams]
-        c = c._replace(usual=ears.usual(c.known, c.model))
+        c = c._replace(usual=source.usual(c.known, c.model))
         # Chosen once a chunk: to take an update back at every step of the warm-up would copy the networks each time.
         idle, busy = (
             lambda c, keys, learns=x: lax.scan(partial(one_step, learns=learns), c, keys)[0] for x in (False, True)
         )
         c = lax.cond(c.steps < agent.warmup, idle, busy, c, tuple(keys))
-        model = ears.study(c.known, c.model, jax.random.fold_in(deep.key_of(one.seed, deep.MODEL), number))
+        model = source.fit(c.known, c.model, jax.random.fold_in(deep.key_of(one.seed, deep.MODEL), number))
         c = c._replace(model=model)
         watch = watch.after(c.steps, c.agent, c.loss, c.largest, model, c.sums, agent.network.value_scale)
         return c._replace(loss=jnp.float32(0.0), largest=jnp.float32(0.0)), number + 1, watch
 
-    known, model = ears.init()
+    known, model = source.init()
     first = world.reset(jax.random.fold_in(deep.key_of(one.seed, deep.WORLD), deep.FIRST))
     learner = agent.init(deep.key_of(one.seed, deep.INIT), world.features, world.actions)
     row = _Row(
@@ -149,7 +145,7 @@ def run(one: Lane, program: Program) -> Outcome:
         buffer=jax.tree.map(lambda x: jnp.zeros((agent.buffer, *jnp.shape(x)), jnp.asarray(x).dtype), row),
         known=known,
         model=model,
-        usual=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(ears.usual, known, model)),
+        usual=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(source.usual, known, model)),
         state=first,
         time=jnp.int32(0),
         episode=jnp.int32(0),
@@ -162,10 +158,7 @@ def run(one: Lane, program: Program) -> Outcome:
 
     def unfinished(loop: tuple[_Carry, Array, deep.Watch]) -> Array:
         c, _, watch = loop
-        going = c.episode < program.episodes
-        if limit is not None:
-            going &= c.steps < limit
-        return going & (watch.fault == 0)
+        return deep.goes_on(program, c.episode, c.steps, watch)
 
     c, _, watch = lax.while_loop(unfinished, chunk, (start, jnp.uint32(0), deep.Watch.start(learner)))
 
@@ -177,4 +170,4 @@ def run(one: Lane, program: Program) -> Outcome:
         opinions = agent.values(c.agent, observe(states), deep.key_of(one.seed, deep.INIT))
         return *mean_and_deviation(opinions), opinions.min(0)
 
-    return deep.outcome(one, program, ears, c, watch, greedy, read)
+    return deep.outcome(one, program, source, c, watch, greedy, read)

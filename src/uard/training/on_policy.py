@@ -1,8 +1,8 @@
 """Training of agents that learn from what they just did, as one compiled program.
 
-One lane steps several copies of its world side by side. After each rollout all its steps are heard, the model of
-ratings is fitted, what is usual is measured, and then the mitigation gives the reward of every step, before advantages
-are computed from it.
+One lane steps several copies of its world side by side. After each rollout the raters are asked about its steps, the
+model of ratings is fitted, what is usual is measured, and then the mitigation gives the reward of every step, before
+advantages are computed from it.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from uard import networks
 from uard.agents.policy import Experience, PolicyGradient
 from uard.envs.world import Step
 from uard.mitigation import Evidence
-from uard.training import deep, off_policy
-from uard.training.deep import LOG, Ears, Lane, Outcome, Program
+from uard.training import deep
+from uard.training.deep import CHUNK, FeedbackSource, Lane, Outcome, Program
+from uard.training.lanes import LOG
 
 
 class _Place(NamedTuple):
@@ -60,20 +61,18 @@ def run(one: Lane, program: Program) -> Outcome:
     """
     world, agent, mitigation = one.world, one.agent, one.mitigation
     assert isinstance(agent, PolicyGradient)
-    ears = Ears(one, program)
+    source = FeedbackSource(one, program)
     copies, length = agent.envs, agent.rollout
     total = copies * length
     # As many fits of the rating model per environment step as the replay loop makes.
-    fits = -(-total // off_policy.CHUNK)
+    fits = -(-total // CHUNK)
 
     def one_world(place: _Place, action: Array, key: Array) -> tuple[_Place, _Row]:
         step_key, reset_key = jax.random.split(key)
         after = world.step(place.state, action, step_key)
         verdict = world.judge(place.state, action, after)
-        truncated = (place.time + 1 >= world.horizon) & ~after.terminated
-        done = after.terminated | truncated
-        counted = [verdict.hack, verdict.reward, after.reward, verdict.goal, 1.0, 0.0]
-        sums = place.sums + jnp.stack([jnp.asarray(x, jnp.float32) for x in counted])
+        done = deep.is_over(world, place.time, after)
+        sums = place.sums + deep.counted(verdict, after)
         cost = jnp.asarray(verdict.hack, jnp.float32) if agent.needs_cost else jnp.float32(0.0)
         fresh = _Place(world.reset(reset_key), jnp.int32(0), jnp.zeros(len(LOG), jnp.float32))
         going = _Place(after.state, place.time + 1, sums)
@@ -97,7 +96,7 @@ def run(one: Lane, program: Program) -> Outcome:
         values, following = both[:, :total], both[:, total:]
         # There are no action values to disagree about: one step ahead, what the members say of the state it led to.
         ahead = jnp.where(after.terminated, 0.0, agent.gamma * networks.mean_and_deviation(following)[1])
-        feedback = ears.of(c.known, c.model, flat.state, flat.action)
+        feedback = source.of(c.known, c.model, flat.state, flat.action)
         signal = mitigation.signal(Evidence(after.reward, jnp.hypot(ahead, after.doubt), feedback), usual)
         slots = jax.vmap(world.slot)(flat.state, flat.action)
         bonus = agent.count_bonus / jnp.sqrt(c.visits[slots])
@@ -135,15 +134,15 @@ def run(one: Lane, program: Program) -> Outcome:
         place, rows = rollout(c, act_key, of_world)
         flat: _Row = _flat(rows)
 
-        def hear(known: Any, x: tuple[_Row, Array]) -> tuple[Any, None]:
+        def record(known: Any, x: tuple[_Row, Array]) -> tuple[Any, None]:
             row, key = x
-            return ears.hear(known, row.state, row.action, row.after, key), None
+            return source.record(known, row.state, row.action, row.after, key), None
 
-        known, _ = lax.scan(hear, c.known, (flat, jax.random.split(of_panel, total)))
+        known, _ = lax.scan(record, c.known, (flat, jax.random.split(of_panel, total)))
         model, _ = lax.scan(
-            lambda model, key: (ears.study(known, model, key), None), c.model, jax.random.split(of_model, fits)
+            lambda model, key: (source.fit(known, model, key), None), c.model, jax.random.split(of_model, fits)
         )
-        usual = ears.usual(known, model)
+        usual = source.usual(known, model)
         visits = c.visits.at[jax.vmap(world.slot)(flat.state, flat.action)].add(1.0)
         ended = jnp.cumsum(flat.done.astype(jnp.int32))
         line = jnp.where(flat.done, jnp.minimum(c.episode + ended - 1, program.episodes), program.episodes)
@@ -164,7 +163,7 @@ def run(one: Lane, program: Program) -> Outcome:
         watch = watch.after(c.steps, learner, watched.loss, watched.largest, model, reward, scale)
         return c, number + 1, watch
 
-    known, model = ears.init()
+    known, model = source.init()
     first = jax.random.fold_in(deep.key_of(one.seed, deep.WORLD), deep.FIRST)
     learner = agent.init(deep.key_of(one.seed, deep.INIT), world.features, world.actions)
     start = _Carry(
@@ -184,10 +183,7 @@ def run(one: Lane, program: Program) -> Outcome:
 
     def unfinished(loop: tuple[_Carry, Array, deep.Watch]) -> Array:
         c, _, watch = loop
-        going = c.episode < program.episodes
-        if program.steps is not None:
-            going &= c.steps < program.steps
-        return going & (watch.fault == 0)
+        return deep.goes_on(program, c.episode, c.steps, watch)
 
     c, _, watch = lax.while_loop(unfinished, chunk, (start, jnp.uint32(0), deep.Watch.start(learner)))
 
@@ -200,7 +196,7 @@ def run(one: Lane, program: Program) -> Outcome:
         of_state = *networks.mean_and_deviation(v), v.min(0)
         return tuple(jnp.broadcast_to(x[:, None], (*x.shape, world.actions)) for x in of_state)
 
-    return deep.outcome(one, program, ears, c, watch, greedy, read)
+    return deep.outcome(one, program, source, c, watch, greedy, read)
 
 
 def _flat(rows: Any) -> Any:
