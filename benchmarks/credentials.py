@@ -1,9 +1,12 @@
 """Do our agents learn what others' do? CartPole-v1 and Acrobot-v1 beside Stable-Baselines3 and sb3-contrib.
 
-    python benchmarks/credentials.py [--seeds 10] [--their-seeds 3] [--only dqn ppo trpo] [--json FILE]
+    python benchmarks/credentials.py [--seeds 10] [--their-seeds 3] [--only dqn ppo trpo]
+                                     [--tasks CartPole Acrobot] [--json FILE]
+
+Rows that are in FILE already, and that this call does not make, stay there.
 
 Same budget of environment steps, network (64, 64), batch, buffer, discount. The number is the mean return of the
-training episodes that end in the last fifth of the budget, one per seed; the interval is over seeds (95 %, Student).
+training episodes that end in the last fifth of the budget, one per seed; the interval is over seeds (95 %, bootstrap).
 Ours run on our own compiled CartPole and Acrobot, which the tests hold to Gymnasium's; theirs run on Gymnasium's.
 """
 
@@ -14,6 +17,7 @@ import json
 import os
 import time
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +31,8 @@ from uard.statistics import Summary, summarise
 
 BUDGET = {"dqn": 30_000, "ppo": 100_000, "trpo": 100_000}
 TASKS = ("CartPole", "Acrobot")
-GAMMA, RATE, VALUE_SCALE = 0.99, 1e-3, {"CartPole": 30.0, "Acrobot": 30.0}
+GAMMA, RATE = 0.99, 1e-3
+VALUE_SCALE = {("ppo", "CartPole"): 100.0, ("trpo", "CartPole"): 100.0}  # 30 elsewhere
 Returns = list[float]
 
 
@@ -46,7 +51,7 @@ def ours(name: str, task: str, seeds: int) -> Returns:
     from uard.training import deep, lanes, off_policy, on_policy
     from uard.training.lanes import LOG
 
-    network = Network(learning_rate=RATE, value_scale=VALUE_SCALE[task])
+    network = Network(learning_rate=RATE, value_scale=VALUE_SCALE.get((name, task), 30.0))
     agents: dict[str, Any] = {
         "dqn": DeepQ(network, gamma=GAMMA, epsilon_decay=0.98),
         "ppo": PPO(network, gamma=GAMMA, count_bonus=0.0),
@@ -139,12 +144,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--their-seeds", type=int, default=3)
     parser.add_argument("--only", nargs="*", default=list(BUDGET), choices=list(BUDGET))
+    parser.add_argument("--tasks", nargs="*", default=list(TASKS), choices=list(TASKS))
     parser.add_argument("--ours-only", action="store_true")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    rows = []
+    rows = {}
+    if arguments.json and arguments.json.exists():
+        rows = {(r["task"], r["agent"], r["who"]): r for r in json.loads(arguments.json.read_text())["rows"]}
     for name in arguments.only:
-        for task in TASKS:
+        for task in arguments.tasks:
             runs: dict[str, tuple[Callable[..., Returns], int]] = {"ours": (ours, arguments.seeds)}
             if not arguments.ours_only:
                 runs["theirs"] = (theirs, arguments.their_seeds)
@@ -159,9 +167,16 @@ def main() -> None:
                     f"{seeds} seeds, {BUDGET[name]} steps, {took:.0f} s",
                     flush=True,
                 )
-                rows.append({"task": task, "agent": name, "who": who, "budget": BUDGET[name], "returns": returns})
+                rows[task, name, who] = {
+                    "task": task,
+                    "agent": name,
+                    "who": who,
+                    "budget": BUDGET[name],
+                    "version": __version__ if who == "ours" else metadata.version("stable-baselines3"),
+                    "returns": returns,
+                }
                 if arguments.json:
-                    arguments.json.write_text(json.dumps({"version": __version__, "rows": rows}, indent=2) + "\n")
+                    arguments.json.write_text(json.dumps({"rows": list(rows.values())}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

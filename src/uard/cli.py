@@ -263,15 +263,15 @@ def _invalid(field: str, value: object, allowed: str) -> Exception:
     return InvalidValueError(field, value, allowed)
 
 
-def _write_json(data: Any, target: str) -> None:
-    text = json.dumps(data, indent=2, allow_nan=False)
+def _write_json(data: Any, target: str, option: str = "json", indent: int | None = 2) -> None:
+    text = json.dumps(data, indent=indent, allow_nan=False)
     if target == "-":
         print(text)
         return
     try:
         Path(target).write_text(text + "\n", encoding="utf-8")
     except OSError as error:
-        raise _invalid("json", target, f"a file that can be written ({error})") from None
+        raise _invalid(option, target, f"a file that can be written ({error})") from None
 
 
 def _check_workers(workers: int | None) -> None:
@@ -302,7 +302,7 @@ def _reproduce(command: Reproduce, console: Console) -> None:
         from uard.reporting import published
 
         line = f"uard reproduce {' '.join(command.studies)} --seeds {command.seeds}"
-        _write_json(published.extract(chosen, store, seeds, line), command.extract)
+        _write_json(published.extract(chosen, store, seeds, line), command.extract, "extract", indent=None)
     if command.report:
         from uard.reporting import page
 

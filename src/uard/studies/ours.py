@@ -139,7 +139,11 @@ def settings() -> tuple[Row, ...]:
         "sigmas in reward units": {"standardise": False},
         "no pseudo-count": {"prior_count": 0.0},
         "sigma_h only (alpha 0)": {"alpha": 0.0},
+        "alpha 0.1": {"alpha": 0.1},
+        "alpha 1": {"alpha": 1.0},
         "sigma_m only (beta 0)": {"beta": 0.0},
+        "beta 0.1": {"beta": 0.1},
+        "beta 1": {"beta": 1.0},
     }
     return tuple(
         row(
