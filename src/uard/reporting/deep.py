@@ -143,6 +143,12 @@ def losses(p: Published) -> list[str]:
     if p.rows("deep-uard"):
         text = f"Deep agents on 10x10: of {len(p.rows('deep-uard'))} settings uard misses 0.5 visits or 95 % goals in {len(missed)}"
         out.append(text + (": " + "; ".join(missed) if missed else "") + ".")
+    unable = [r for r in p.rows("deep-competence") if p.of(r, "goal_rate").mean < 0.95]
+    if unable:
+        goals = "; ".join(f"{r['agent']} {brief(p.of(r, 'goal_rate'))}" for r in unable)
+        out.append(
+            f"On the true reward of 10x10 these agents miss 95 % goals in the paper's budget, so what they do there with uard says little: {goals}."
+        )
     out += matched(p)
     for r in p.rows("deep-feedback", source="table"):
         for model in p.rows("deep-feedback", source="model", rated=r["rated"]):
