@@ -322,9 +322,9 @@ def drawn(p: Published) -> list[tuple[str, str, str]]:
         note = "Mean over seeds, bins of 10 episodes. A low observed return is no virtue; a high one is the hack."
         made.append(("G16 · observed return of all deep agents, 10x10, T = 100", note, _curves(p)))
     if len(p.rows("deep-distortion")) == 3:
-        note = "Seed 0. Shaded: the windows in which the observed reward is inflated. Spikes outside them are arrivals at the goal."
+        note = "Seed 0. Shaded: the windows in which the observed reward is inflated. Arrivals at the goal are left out."
         made.append(("G14, G15 · confidence-adjusted reward under distortion", note, _adjusted(p)))
-        note = "Above: what each would learn from; below: lambda_t of uard, which rises where the reward contradicts the raters."
+        note = "Left: what each would learn from; right: lambda_t of uard, which rises where the reward contradicts the raters."
         made.append(("G12 · a hacking region, and lambda_t", note, _region(p)))
     return [(title, note, figures.data_uri(figure)) for title, note, figure in made]
 
@@ -346,8 +346,11 @@ def _curves(p: Published) -> Figure:
 
 
 def _trace(p: Published, agent: str) -> np.ndarray:
+    """Return seed 0's trace; arrivals at the goal, ten times everything else, are left out."""
     (r,) = p.rows("deep-distortion", agent=agent)
-    return p.derived(r, "trace")
+    trace = p.derived(r, "trace")
+    trace[:, trace[0] > 5.0] = np.nan
+    return trace
 
 
 def _shade(axis: Any) -> None:
