@@ -58,6 +58,8 @@ class Run:
     """How a deep agent knows of ratings: model (learned; what is taken if left out) or table (running means)."""
     episodes: int = 500
     """Training episodes."""
+    steps: int | None = None
+    """Environment steps, instead of episodes, for Hopper and Walker2d; 1 000 000 if left out."""
     seeds: int = 10
     """Number of seeds (0, 1, ...)."""
     json: str | None = None
@@ -173,7 +175,7 @@ def _run(command: Run, console: Console) -> None:
         if noise:
             raise _checks.InvalidValueError("noise", noise, "left out when --noise-fraction is given")
         noise = command.noise_fraction * abs(trap_reward)
-    agent = names.agent(command.agent, names.settings(command.set_agent, "--set-agent"))
+    agent = names.agent(command.agent, names.settings(command.set_agent, "--set-agent"), environment)
     cell = Cell(
         environment,
         names.mitigation_named(command.mitigation, names.settings(command.set_mitigation, "--set-mitigation")),
@@ -182,7 +184,8 @@ def _run(command: Run, console: Console) -> None:
         noise,
         command.rated,
         command.episodes,
-        feedback=names.feedback(command.feedback, agent),
+        feedback=names.feedback(command.feedback, agent, environment),
+        steps=command.steps,
     )
     store = Store(command.store or ":memory:")
     seeds = range(command.seeds)
@@ -355,6 +358,7 @@ def _list(command: List, console: Console) -> None:
     rows: dict[str, dict[str, str]] = {
         "environments": {k: str(v) for k, v in names.ENVIRONMENTS.items()},
         "agents": {k: str(v) for k, v in names.AGENTS.items()},
+        "agents for Hopper and Walker2d": {k: str(v) for k, v in names.CONTINUOUS.items()},
         "mitigations": {k: str(mitigation.named(k)) for k in mitigation.NAMED},
         "panels": {k: (v.__doc__ or "").split("\n")[0] for k, v in PANELS.items()},
         **{

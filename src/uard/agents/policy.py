@@ -21,6 +21,8 @@ from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 
 from uard import _checks, networks
+from uard.agents import heads
+from uard.agents.heads import Said, divergence, entropy, log_probability
 from uard.agents.off_policy import Watched
 from uard.networks import SINGLE, Ensemble, Layer, Network, Weights
 
@@ -149,21 +151,20 @@ class PolicyGradient:
         """Whether the loop has to tell which steps were hacks: only of an oracle (see ``CPO``)."""
         return False
 
-    def init(self, key: Array, features: int, actions: int) -> State:
-        """Return fresh networks; the policy is close to uniform."""
+    def init(self, key: Array, features: int, actions: int, continuous: bool = False) -> State:
+        """Return fresh networks; the policy is close to uniform, or to a standard normal."""
         own, critic = jax.random.split(key)
-        sizes = (features, self.network.hidden, self.network.hidden, actions)
-        policy = networks.mlp(own, sizes, last_gain=0.01)
+        policy = heads.init(own, self.network, features, actions, continuous)
         value = networks.init(self.ensemble, self.network, critic, features, 1)
         return State(policy, value, self._adam().init(policy), self._adam().init(value.layers), ())
 
     def act(self, state: State, observations: Array, key: Array) -> Array:
-        """Draw an action for each of (B, features) observations."""
-        return jax.random.categorical(key, networks.through(state.policy, observations)).astype(jnp.int32)
+        """Draw an action for each of (B, features) observations; continuous ones have no bounds."""
+        return heads.draw(heads.say(state.policy, observations), key)
 
     def greedy(self, state: State, observation: Array) -> Array:
         """Return the likeliest action for one observation (features,)."""
-        return jnp.argmax(networks.through(state.policy, observation[None])[0]).astype(jnp.int32)
+        return heads.likeliest(heads.say(state.policy, observation[None]))[0]
 
     def values(self, state: State, observations: Array, key: Array) -> Array:
         """Return all members' values (N, B) of observations (B, features)."""
@@ -257,15 +258,15 @@ class PPO(PolicyGradient):
     def update(self, state: State, experience: Experience, key: Array) -> tuple[State, Watched]:
         """Take ``epochs`` times ``minibatches`` steps of Adam on policy and critic."""
         batch = self._batch(experience)
-        old = log_probability(networks.through(state.policy, batch.observation), batch.action)
+        old = log_probability(heads.say(state.policy, batch.observation), batch.action)
 
         def one(s: State, x: tuple[Array, Array]) -> tuple[State, tuple[Array, Array]]:
             part, before = _take(batch, x[0]), old[x[0]]
 
             def loss(policy: Layers, layers: Layers) -> tuple[Array, tuple[Array, Array]]:
-                logits = networks.through(policy, part.observation)
-                gain = clipped_surrogate(log_probability(logits, part.action) - before, part.advantage, self.clip)
-                gain = (part.weight * (gain + self.entropy * entropy(logits))).mean()
+                said = heads.say(policy, part.observation)
+                gain = clipped_surrogate(log_probability(said, part.action) - before, part.advantage, self.clip)
+                gain = (part.weight * (gain + self.entropy * entropy(said))).mean()
                 fit, watched = self._critic_loss(self.ensemble, Weights(layers, s.value.prior), part, x[1])
                 return fit - gain, (fit - gain, watched[1])
 
@@ -315,20 +316,20 @@ class TRPO(PolicyGradient):
     def improved(self, policy: Layers, batch: Batch) -> Layers:
         """Return the policy after one step of at most ``delta``; the same if no step of the line search improves it."""
         theta, shape = ravel_pytree(policy)
-        logits_of = _logits_of(shape, batch)
-        old = logits_of(theta)
+        said_of = _said_of(shape, batch)
+        old = said_of(theta)
 
         def gain(theta: Array) -> Array:
-            return surrogate(logits_of(theta), old, batch.action, batch.weight * batch.advantage)
+            return surrogate(said_of(theta), old, batch.action, batch.weight * batch.advantage)
 
         gradient = jax.grad(gain)(theta)
-        product = fisher_product(logits_of, theta, self.damping)
+        product = fisher_product(said_of, theta, self.damping)
         direction = conjugate_gradient(product, gradient, self.conjugate_steps)
         step = jnp.sqrt(2.0 * self.delta / jnp.maximum(direction @ product(direction), TINY)) * direction
         before = gain(theta)
 
         def accept(new: Array) -> Array:
-            return (divergence(old, logits_of(new)) <= self.delta) & (gain(new) > before)
+            return (divergence(old, said_of(new)) <= self.delta) & (gain(new) > before)
 
         return shape(line_search(theta, step, accept, self.backtracks, self.shrink))
 
@@ -363,14 +364,14 @@ class CPO(TRPO):
         """Whether the loop has to tell which steps were hacks."""
         return self.oracle
 
-    def init(self, key: Array, features: int, actions: int) -> State:
+    def init(self, key: Array, features: int, actions: int, continuous: bool = False) -> State:
         """Return fresh networks; the cost critic expects none."""
         own, other = jax.random.split(key)
         weights = networks.init(SINGLE, self.network, other, features, 1)
         last = jax.tree.map(jnp.zeros_like, weights.layers[-1])
         weights = Weights((*weights.layers[:-1], last), None)
         costs = Costs(weights, self._adam().init(weights.layers), jnp.float32(0.0), jnp.float32(0.0))
-        return super().init(own, features, actions)._replace(costs=costs)
+        return super().init(own, features, actions, continuous)._replace(costs=costs)
 
     def update(self, state: State, experience: Experience, key: Array) -> tuple[State, Watched]:
         """Take one step of the policy, then fit both critics."""
@@ -410,17 +411,17 @@ class CPO(TRPO):
             excess: By how much the old policy's cost per step is above the budget.
         """
         theta, shape = ravel_pytree(policy)
-        logits_of = _logits_of(shape, batch)
-        old = logits_of(theta)
+        said_of = _said_of(shape, batch)
+        old = said_of(theta)
 
         def gain(theta: Array) -> Array:
-            return surrogate(logits_of(theta), old, batch.action, batch.weight * batch.advantage)
+            return surrogate(said_of(theta), old, batch.action, batch.weight * batch.advantage)
 
         def price(theta: Array) -> Array:
-            return surrogate(logits_of(theta), old, batch.action, cost_advantage)
+            return surrogate(said_of(theta), old, batch.action, cost_advantage)
 
         g, b = jax.grad(gain)(theta), jax.grad(price)(theta)
-        product = fisher_product(logits_of, theta, self.damping)
+        product = fisher_product(said_of, theta, self.damping)
         solve = jax.vmap(lambda v: conjugate_gradient(product, v, self.conjugate_steps))
         to_gain, to_price = solve(jnp.stack([g, b]))
         q, r, s = g @ to_gain, g @ to_price, b @ to_price
@@ -429,7 +430,7 @@ class CPO(TRPO):
         gain_before, price_before = gain(theta), price(theta)
 
         def accept(new: Array) -> Array:
-            near = divergence(old, logits_of(new)) <= self.delta
+            near = divergence(old, said_of(new)) <= self.delta
             cheap = price(new) - price_before <= jnp.maximum(-excess, 0.0)
             # Who is beyond the budget has to come back first, whatever the gain.
             better = (gain(new) > gain_before) | (excess > 0) | ~feasible
@@ -479,50 +480,28 @@ def standardised(advantage: Array, weight: Array) -> Array:
     return centred / (jnp.sqrt((weight * centred**2).sum() / total) + 1e-8)
 
 
-def log_probability(logits: Array, action: Array) -> Array:
-    """Return the log-probability (B,) of actions (B,) under logits (B, A)."""
-    return jnp.take_along_axis(jax.nn.log_softmax(logits), action[:, None], 1)[:, 0]
-
-
-def entropy(logits: Array) -> Array:
-    """Return the entropy (B,) of logits (B, A), in nats."""
-    logs = jax.nn.log_softmax(logits)
-    return -(jnp.exp(logs) * logs).sum(-1)
-
-
-def divergence(old: Array, new: Array) -> Array:
-    """Return the mean KL(old || new) of logits (B, A), in nats."""
-    before, after = jax.nn.log_softmax(old), jax.nn.log_softmax(new)
-    return (jnp.exp(before) * (before - after)).sum(-1).mean()
-
-
 def clipped_surrogate(log_ratio: Array, advantage: Array, clip: Array | float) -> Array:
     """PPO's min(ratio A, clip(ratio, 1 - clip, 1 + clip) A) [Schulman et al. 2017, eq. 7], elementwise."""
     ratio = jnp.exp(log_ratio)
     return jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage)
 
 
-def surrogate(new: Array, old: Array, action: Array, advantage: Array) -> Array:
-    """Return the mean of ratio times advantage, for logits (B, A), actions and advantages (B,)."""
+def surrogate(new: Said, old: Said, action: Array, advantage: Array) -> Array:
+    """Return the mean of ratio times advantage (B,), for what the policies say of the actions."""
     ratio = jnp.exp(log_probability(new, action) - lax.stop_gradient(log_probability(old, action)))
     return (ratio * advantage).mean()
 
 
-def fisher_product(
-    logits_of: Callable[[Array], Array], theta: Array, damping: Array | float
-) -> Callable[[Array], Array]:
+def fisher_product(said_of: Callable[[Array], Any], theta: Array, damping: Array | float) -> Callable[[Array], Array]:
     """Return v -> (F + damping) v, F the Fisher matrix of the mean KL at ``theta``.
 
-    ``logits_of`` maps parameters (P,) to logits (B, A). F is J' M J / B, with M = diag(p) - p p' of each row.
+    ``said_of`` maps parameters (P,) to what the policy says. F is J' M J / B, see ``heads.curvature``.
     """
-    logits, push = jax.linearize(logits_of, theta)
+    said, push = jax.linearize(said_of, theta)
     pull = jax.linear_transpose(push, theta)
-    p = jax.nn.softmax(logits)
 
     def product(v: Array) -> Array:
-        u = push(v)
-        u = p * (u - (p * u).sum(-1, keepdims=True)) / p.shape[0]
-        return pull(u)[0] + damping * v
+        return pull(heads.curvature(said, push(v)))[0] + damping * v
 
     return product
 
@@ -592,8 +571,8 @@ def line_search(
     return jnp.where(found, theta + factor * step, theta)
 
 
-def _logits_of(shape: Callable[[Array], Any], batch: Batch) -> Callable[[Array], Array]:
-    return lambda theta: networks.through(shape(theta), batch.observation)
+def _said_of(shape: Callable[[Array], Any], batch: Batch) -> Callable[[Array], Any]:
+    return lambda theta: heads.say(shape(theta), batch.observation)
 
 
 def _flat(x: Array) -> Array:

@@ -13,15 +13,18 @@ import numpy as np
 
 from uard import _checks
 from uard.agents.tabular import QLearning
+from uard.envs.mujoco import Locomotion
 from uard.envs.panels import PANELS
 from uard.envs.spec import Spec
 from uard.envs.trapgrid import TrapGrid
 from uard.feedback.learned import RatingModel
+from uard.feedback.transitions import TransitionModel
 from uard.lab import names
 from uard.mitigation import Mitigation, Raw
 
 # Raise this when training code changes what a cell means: old results are then not found, never mixed in.
 RESULTS = 2
+STEPS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -29,17 +32,18 @@ class Cell:
     """One environment, panel, agent and mitigation, trained for some episodes.
 
     Attributes:
-        environment: Where it learns: an ``uard.envs.spec.Spec``.
+        environment: Where it learns: an ``uard.envs.spec.Spec``, or a ``Locomotion``.
         mitigation: What the agent does about a reward that may lie.
         agent: The learner.
         panel: Who rates. Irrelevant, and therefore ignored, for a mitigation that reads no ratings.
         noise: Standard deviation of extra noise on every rater, in reward units.
         rated: Fraction of steps that are rated, in [0, 1].
-        episodes: Training episodes, >= 1.
+        episodes: Training episodes, >= 1; ignored for a ``Locomotion``.
         ddof: Of the annotators' deviation.
         snapshots: Tables kept along the way, for the uncertainty curves; tabular agents only.
         feedback: How a deep agent knows of ratings: a model of them, or running means per state-action if None (which a
-            tabular agent always has).
+            tabular agent always has). For a ``Locomotion`` always a model of transitions.
+        steps: Environment steps, for a ``Locomotion`` only; 1 000 000 if None.
     """
 
     environment: Any = field(default_factory=TrapGrid)
@@ -51,7 +55,8 @@ class Cell:
     episodes: int = 500
     ddof: int = 0
     snapshots: int = 0
-    feedback: RatingModel | None = None
+    feedback: RatingModel | TransitionModel | None = None
+    steps: int | None = None
 
     def __post_init__(self) -> None:
         """Check everything; forget what cannot matter.
@@ -66,12 +71,21 @@ class Cell:
         _checks.whole("episodes", self.episodes, low=1, high=1_000_000)
         _checks.whole("ddof", self.ddof, low=0, high=1)
         _checks.whole("snapshots", self.snapshots, low=0, high=1000)
-        for name, kind in (("environment", Spec), ("mitigation", Mitigation), ("agent", names.Agent)):
+        for name, kind in (("environment", Spec | Locomotion), ("mitigation", Mitigation), ("agent", names.Agent)):
             value = getattr(self, name)
             if not isinstance(value, kind) or not _is_frozen(value):
                 raise _checks.InvalidValueError(name, value, f"a frozen dataclass that is {_an(kind)}")
             object.__setattr__(self, name, _settled(name, value))
         names.check_pair(self.agent, self.environment)
+        physical = isinstance(self.environment, Locomotion)
+        if physical:
+            _checks.whole("steps", STEPS if self.steps is None else self.steps, low=1, high=10**12)
+            object.__setattr__(self, "steps", int(STEPS if self.steps is None else self.steps))
+            object.__setattr__(self, "episodes", 500)
+            if self.feedback is None:
+                object.__setattr__(self, "feedback", TransitionModel())
+        elif self.steps is not None:
+            raise _checks.InvalidValueError("steps", self.steps, "left out but for Hopper and Walker2d; see episodes")
         if isinstance(self.agent, QLearning):
             if self.feedback is not None:
                 raise _checks.InvalidValueError(
@@ -80,8 +94,9 @@ class Cell:
         elif self.snapshots:
             raise _checks.InvalidValueError("snapshots", self.snapshots, "0 for an agent that keeps no tables")
         if self.feedback is not None:
-            if not isinstance(self.feedback, RatingModel):
-                raise _checks.InvalidValueError("feedback", self.feedback, "a RatingModel or none")
+            wanted = TransitionModel if physical else RatingModel
+            if not isinstance(self.feedback, wanted):
+                raise _checks.InvalidValueError("feedback", self.feedback, f"a {wanted.__name__} or none")
             object.__setattr__(self, "feedback", _settled("feedback", self.feedback))
         if not self.mitigation.reads_feedback:
             for name, value in (("panel", "main"), ("noise", 0.0), ("rated", 1.0), ("feedback", None)):
@@ -90,10 +105,11 @@ class Cell:
             object.__setattr__(self, name, kind(getattr(self, name)))
 
     def config(self) -> dict[str, Any]:
-        """Return the whole configuration as plain data; without ``feedback`` where it is none."""
+        """Return the whole configuration as plain data; without ``feedback`` and ``steps`` where they are none."""
         config = plain(self)
-        if self.feedback is None:
-            del config["feedback"]
+        for name in ("feedback", "steps"):
+            if config[name] is None:
+                del config[name]
         return config
 
     @cached_property

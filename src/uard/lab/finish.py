@@ -113,6 +113,12 @@ def finish_deep(cell: Cell, seed: int, out: dict[str, Any]) -> Result:
     return Result(log, int(out["steps"]), path, extra)
 
 
+def finish_host(done: Any) -> Result:
+    """Turn a run in MuJoCo into a result; ``evaluation`` and ``ends`` are those of ``training.host.Done``."""
+    extra = {"evaluation": done.evaluation.astype(np.float32), "ends": done.ends}
+    return Result(done.log.astype(np.float32), int(done.live.steps), np.zeros(0, np.int32), extra)
+
+
 def arrays_by_place(tree: Any) -> dict[str, np.ndarray]:
     """Return a pytree's arrays by their place in it."""
     import jax

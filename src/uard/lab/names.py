@@ -8,13 +8,16 @@ from typing import Any
 
 from uard import _checks, mitigation
 from uard.abstention import Abstention
+from uard.agents import continuous
 from uard.agents.actor_critic import SoftActorCritic, edac
+from uard.agents.continuous import ContinuousActorCritic
 from uard.agents.off_policy import OffPolicy
 from uard.agents.policy import CPO, PPO, TRPO, PolicyGradient
 from uard.agents.tabular import QLearning
 from uard.agents.value import DeepQ
 from uard.envs.classic import Acrobot, CartPole
 from uard.envs.gaming import AbsentSupervisor, BoatRace, TomatoWatering
+from uard.envs.mujoco import Locomotion, Posture, Vibration
 from uard.envs.panels import PANELS
 from uard.envs.spec import Tables
 from uard.envs.trapgrid import TrapGrid
@@ -33,6 +36,14 @@ ENVIRONMENTS: dict[str, Any] = {
         for spec in (BoatRace, TomatoWatering, AbsentSupervisor)
         for suffix in ("", "-Legitimate")
     },
+    **{
+        f"{name}-{region.__name__}{suffix}": Locomotion(robot, region=region(), legitimate=bool(suffix))
+        for name, robot in (("Hopper", "hopper"), ("Walker2d", "walker2d"))
+        for region in (Vibration, Posture)
+        for suffix in ("", "-Legitimate")
+    },
+    "Hopper": Locomotion("hopper", region=None),
+    "Walker2d": Locomotion("walker2d", region=None),
     "CartPole": CartPole(),
     "Acrobot": Acrobot(),
 }
@@ -59,7 +70,32 @@ def deep_agents(network: Network | None = None) -> dict[str, Any]:
     }
 
 
-Agent = QLearning | OffPolicy | PolicyGradient
+def continuous_agents(small: bool = False) -> dict[str, Any]:
+    """Return the agents for continuous actions by name, with one network for all of a family (J35).
+
+    Args:
+        small: 64 units and batches of 128 for the actor-critic family, for a CPU; else 256 and 256.
+    """
+    one = Network(64, 3e-4, 100.0)  # values are as large as 1 / (1 - gamma)
+    shared: dict[str, Any] = {"gamma": 0.99, "rollout": 256, "epochs": 10, "minibatches": 32, "count_bonus": 0.0}
+    critic: dict[str, Any] = {"network": Network(256, 3e-4, 1.0)}
+    if small:
+        critic = {"network": Network(64, 1e-3, 1.0), "batch": 128, "warmup": 2_000}
+    return {
+        "ppo": PPO(one, entropy=0.0, **shared),
+        "trpo": TRPO(one, **shared),
+        "cpo": CPO(one, oracle=False, **shared),
+        "cpo-oracle": CPO(one, **shared),
+        "sac": continuous.sac(**critic),
+        "ensemble-sac": continuous.ensemble_sac(**critic),
+        "cql": continuous.cql(**critic),
+        "edac": continuous.edac(**critic),
+        "sunrise": continuous.sunrise(**critic),
+    }
+
+
+Agent = QLearning | OffPolicy | PolicyGradient | ContinuousActorCritic
+CONTINUOUS: dict[str, Any] = continuous_agents()
 AGENTS: dict[str, Agent] = {
     "q-learning": QLearning(),
     "random-walk": QLearning(1, 0.1, 0.95, 1.0, 1.0, 1.0),
@@ -68,7 +104,11 @@ AGENTS: dict[str, Agent] = {
 
 
 def can_work(agent: Any, environment: Any) -> bool:
-    """Whether an agent can work in an environment: one with tables needs an environment that fits into them."""
+    """Whether an agent can work in an environment: tables need one that fits into them, motors a continuous agent."""
+    if isinstance(environment, Locomotion):
+        return isinstance(agent, PolicyGradient | ContinuousActorCritic)
+    if isinstance(agent, ContinuousActorCritic):
+        return False
     return isinstance(environment, Tables) or not isinstance(agent, QLearning)
 
 
@@ -79,11 +119,21 @@ def check_pair(agent: Any, environment: Any) -> None:
         InvalidValueError: with the names of those that can.
     """
     if not can_work(agent, environment):
-        able = ", ".join(name for name, other in AGENTS.items() if can_work(other, environment))
-        where = type(environment).__name__
+        able = ", ".join(name for name, other in agents(environment).items() if can_work(other, environment))
+        if isinstance(environment, Locomotion):
+            why = "whose actions are continuous"
+        elif isinstance(agent, ContinuousActorCritic):
+            why = "whose actions are discrete"
+        else:
+            why = "which does not fit into tables"
         raise _checks.InvalidValueError(
-            "agent", agent, f"one that can work in {where}, which does not fit into tables: {able}"
+            "agent", agent, f"one that can work in {type(environment).__name__}, {why}: {able}"
         )
+
+
+def agents(environment: Any) -> dict[str, Any]:
+    """Return the agents by name, as they are for an environment."""
+    return CONTINUOUS if isinstance(environment, Locomotion) else AGENTS
 
 
 def settings(pairs: tuple[str, ...], option: str = "--set") -> dict[str, Any]:
@@ -150,16 +200,24 @@ def _bare(grid: TrapGrid) -> TrapGrid:
     return copy
 
 
-def agent(name: str, changes: dict[str, Any]) -> Agent:
-    """Return an agent by name, some fields changed (``abstention.rule`` and the like make it abstain)."""
-    base = AGENTS[_checks.choose("agent", name, AGENTS)]
+def agent(name: str, changes: dict[str, Any], environment: Any = None) -> Agent:
+    """Return an agent by name, as it is for an environment, some fields changed.
+
+    ``abstention.rule`` and the like make a tabular one abstain.
+    """
+    known = agents(environment)
+    base = known[_checks.choose("agent", name, known)]
     if isinstance(base, QLearning) and any(field.partition(".")[0] == "abstention" for field in changes):
         base = dataclasses.replace(base, abstention=Abstention())
     return changed(base, changes, "agent")
 
 
-def feedback(name: str | None, of: Agent) -> RatingModel | None:
+def feedback(name: str | None, of: Agent, environment: Any = None) -> RatingModel | None:
     """Return how an agent knows of ratings: ``model`` (a deep agent's default) or ``table`` (a tabular one's)."""
+    if isinstance(environment, Locomotion):
+        if name not in (None, "model"):
+            raise _checks.InvalidValueError("feedback", name, "model, or left out: no step comes twice")
+        return None
     if name is None:
         return None if isinstance(of, QLearning) else RatingModel()
     return RatingModel() if _checks.choose("feedback", name, ("model", "table")) == "model" else None

@@ -21,6 +21,8 @@ import numpy as np
 from uard.agents.tabular import QLearning
 from uard.envs.spec import Tables
 from uard.envs.tabular import MIN_STATES
+from uard.feedback.learned import RatingModel
+from uard.feedback.transitions import TransitionModel
 from uard.lab.cell import Cell
 from uard.lab.result import DivergedError, Result
 from uard.lab.store import Store
@@ -67,6 +69,8 @@ def shape_of(cell: Cell) -> tuple[Any, ...]:
         where = structure(plain(cell.environment))
     raters = 1 if cell.panel == "single" else 3
     program = (mitigation, agent, where, raters, cell.episodes, cell.ddof, cell.snapshots, str(cell.feedback))
+    if cell.steps is not None:
+        return (*program, cell.steps), cell.steps * 1000
     return program, (cell.environment.horizon or 0) * cell.episodes * (1 if _tabular(cell) else 1000)
 
 
@@ -75,13 +79,14 @@ def _tabular(cell: Cell) -> bool:
 
 
 def batches(jobs: Iterable[Job], size: int = BATCH) -> list[list[Job]]:
-    """Group jobs that one program can train, the longest first; of deep agents ``DEEP_BATCH`` at most."""
+    """Group jobs that one program can train, longest first; ``DEEP_BATCH`` of deep agents at most, in MuJoCo one."""
     groups: dict[Any, list[Job]] = {}
     for job in jobs:
         groups.setdefault(shape_of(job[0]), []).append(job)
     cut = []
     for group in groups.values():
-        most = size if _tabular(group[0][0]) else min(size, DEEP_BATCH)
+        first = group[0][0]
+        most = size if _tabular(first) else 1 if first.steps is not None else min(size, DEEP_BATCH)
         cut += [group[i : i + most] for i in range(0, len(group), most)]
     return sorted(cut, key=lambda batch: -shape_of(batch[0][0])[1] * len(batch))
 
@@ -95,8 +100,13 @@ def train_batch(batch: Sequence[Job]) -> list[Result]:
     return [finished() for finished in _train_lanes(batch)]
 
 
-def _train_lanes(batch: Sequence[Job]) -> list[Callable[[], Result]]:
-    """Train a batch; what is returned finishes one job each, and raises if that one diverged."""
+def _train_lanes(batch: Sequence[Job], folder: Path | None = None) -> list[Callable[[], Result]]:
+    """Train a batch; what is returned finishes one job each, and raises if that one diverged.
+
+    Long runs keep checkpoints in ``folder``, and go on from them.
+    """
+    if batch[0][0].steps is not None:
+        return [partial(_train_host, cell, seed, folder) for cell, seed in batch]
     if not _tabular(batch[0][0]):
         return _train_deep(batch)
     from uard.lab.finish import finish
@@ -123,6 +133,34 @@ def _train_lanes(batch: Sequence[Job]) -> list[Callable[[], Result]]:
     return finishers
 
 
+def checkpoint_of(folder: Path, cell: Cell, seed: int) -> Path:
+    """Return where a run keeps its checkpoint."""
+    return folder / f"{cell.key}-{seed}.checkpoint"
+
+
+def _train_host(cell: Cell, seed: int, folder: Path | None) -> Result:
+    from uard.lab.finish import finish_host
+    from uard.training import host
+    from uard.training.xla import keep_programs
+
+    keep_programs()
+    assert cell.steps is not None
+    job = host.Job(
+        cell.environment,
+        cell.agent,
+        cell.mitigation,
+        seed,
+        cell.steps,
+        cell.panel,
+        cell.noise,
+        cell.rated,
+        cell.feedback if isinstance(cell.feedback, TransitionModel) else TransitionModel(),
+        cell.ddof,
+    )
+    path = None if folder is None else checkpoint_of(folder, cell, seed)
+    return finish_host(host.run(job, path, f"{cell.key} {seed}"))
+
+
 def _train_deep(batch: Sequence[Job]) -> list[Callable[[], Result]]:
     from uard.agents.off_policy import OffPolicy
     from uard.lab.finish import finish_deep
@@ -131,9 +169,10 @@ def _train_deep(batch: Sequence[Job]) -> list[Callable[[], Result]]:
 
     keep_programs()
     first = batch[0][0]
+    models = {cell: f if isinstance(f := cell.feedback, RatingModel) else None for cell, _ in batch}
     worlds = {cell: cell.environment.world(cell.panel, cell.noise) for cell, _ in batch}
     several = [
-        deep.lane(worlds[cell], cell.agent, cell.mitigation, seed, cell.rated, cell.feedback) for cell, seed in batch
+        deep.lane(worlds[cell], cell.agent, cell.mitigation, seed, cell.rated, models[cell]) for cell, seed in batch
     ]
     loop = off_policy.run if isinstance(first.agent, OffPolicy) else on_policy.run
     out = lanes.train(several, loop, deep.Program(first.episodes, ddof=first.ddof), deep.Outcome._fields, deep.ROOM)
@@ -164,11 +203,15 @@ def run(jobs: Sequence[Job], store: Store, workers: int | None = None, progress:
     done, failures = 0, []
     if progress:
         progress(0, len(todo))
-    outcomes = _here(queue) if workers <= 1 or len(queue) == 1 else _spread(queue, workers)
+    folder = None if store.path == ":memory:" else Path(f"{store.path}-checkpoints")
+    outcomes = _here(queue, folder) if workers <= 1 or len(queue) == 1 else _spread(queue, workers, folder)
     for batch, answer in outcomes:
         answers = [answer] * len(batch) if isinstance(answer, str) else [_kept(a, store) for a in answer]
         pairs = list(zip(batch, answers, strict=True))
         store.put([(cell, seed, result) for (cell, seed), result in pairs if isinstance(result, Result)])
+        for (cell, seed), result in pairs:
+            if folder is not None and cell.steps is not None and isinstance(result, Result):
+                checkpoint_of(folder, cell, seed).unlink(missing_ok=True)
         for error in dict.fromkeys(a for a in answers if isinstance(a, str)):
             failures.append(Failure(tuple(job for job, a in pairs if a == error), error))
         done += len(batch)
@@ -201,13 +244,13 @@ Answer = list[Result | DivergedError | str] | str
 Outcomes = Iterable[tuple[list[Job], Answer]]
 
 
-def _here(queue: Iterable[list[Job]]) -> Outcomes:
+def _here(queue: Iterable[list[Job]], folder: Path | None) -> Outcomes:
     for batch in queue:
-        yield batch, _attempt(lambda batch=batch: batch)
+        yield batch, _attempt(lambda batch=batch: (batch, folder))
 
 
-def _attempt(batch: Callable[[], Sequence[Job]]) -> Answer:
-    answer = _guarded(lambda: _train_lanes(batch()))
+def _attempt(work: Callable[[], tuple[Sequence[Job], Path | None]]) -> Answer:
+    answer = _guarded(lambda: _train_lanes(*work()))
     return answer if isinstance(answer, str) else [_guarded(finished) for finished in answer]
 
 
@@ -231,11 +274,11 @@ def _work(pipe: Connection, core: int | None) -> None:
         return  # the parent is done, or gone
 
 
-def _spread(queue: list[list[Job]], workers: int) -> Outcomes:
+def _spread(queue: list[list[Job]], workers: int, folder: Path | None) -> Outcomes:
     """Hand batches to processes, one per core; a process prefers programs that it has compiled already."""
     context = mp.get_context("spawn")
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    packed = [(batch, _packed(batch)) for batch in queue]
+    packed = [(batch, _packed((batch, folder))) for batch in queue]
     waiting = [(batch, data) for batch, data in packed if data is not None]
     processes: dict[Connection, tuple[Any, int | None]] = {}
     compiled: dict[Connection, set[Any]] = {}
@@ -292,13 +335,13 @@ def _spread(queue: list[list[Job]], workers: int) -> Outcomes:
                 process.terminate()
         for process, _ in processes.values():
             process.join()
-    yield from _here(batch for batch, data in packed if data is None)
+    yield from _here((batch for batch, data in packed if data is None), folder)
 
 
-def _packed(batch: list[Job]) -> bytes | None:
+def _packed(work: tuple[list[Job], Path | None]) -> bytes | None:
     """Pickle a batch; one that cannot be (its class is local to a function, say) is trained in this process."""
     try:
-        return pickle.dumps(batch)
+        return pickle.dumps(work)
     except Exception:
         return None
 

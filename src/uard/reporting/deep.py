@@ -322,7 +322,9 @@ def drawn(p: Published) -> list[tuple[str, str, str]]:
         note = "Mean over seeds, bins of 10 episodes. A low observed return is no virtue; a high one is the hack."
         made.append(("G16 · observed return of all deep agents, 10x10, T = 100", note, _curves(p)))
     if len(p.rows("deep-distortion")) == 3:
-        note = "Seed 0. Shaded: the windows in which the observed reward is inflated. Arrivals at the goal are left out."
+        note = (
+            "Seed 0. Shaded: the windows in which the observed reward is inflated. Arrivals at the goal are left out."
+        )
         made.append(("G14, G15 · confidence-adjusted reward under distortion", note, _adjusted(p)))
         note = "Left: what each would learn from; right: lambda_t of uard, which rises where the reward contradicts the raters."
         made.append(("G12 · a hacking region, and lambda_t", note, _region(p)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from uard import _checks
 from uard.lab.study import Study
-from uard.studies import deep, ours, paper
+from uard.studies import deep, locomotion, ours, paper
 
 
 def grid() -> tuple[Study, ...]:
@@ -14,7 +14,11 @@ def grid() -> tuple[Study, ...]:
 
 def groups() -> dict[str, tuple[Study, ...]]:
     """Return the studies by the name under which they are run together."""
-    return {"grid": grid(), "grid-deep": deep.studies(), "games": deep.others()}
+    sizes = {
+        f"mujoco-{scale.name}": locomotion.studies(scale)
+        for scale in (locomotion.SMOKE, locomotion.STANDARD, locomotion.PAPER)
+    }
+    return {"grid": grid(), "grid-deep": deep.studies(), "games": deep.others(), **sizes}
 
 
 def every() -> tuple[Study, ...]:

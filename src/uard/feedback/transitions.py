@@ -1,0 +1,178 @@
+"""What a learner in a continuous world knows of its raters: a sample of rated steps, and a model for all others.
+
+No step comes twice, so there are no running means. ``Reservoir`` is a uniform sample of all steps rated so far (it must
+not forget what honest steps look like when the agent no longer takes them); ``TransitionModel`` regresses what was said
+on (s, a, s', observed reward). sigma_h of a step is composed at use from the predicted ratings and the reward that was
+observed, which tells hacks apart far better than a predicted spread.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array, lax
+
+from uard import _checks
+from uard.mitigation import Feedback
+from uard.networks import Layer, descend, mlp, through
+
+SAID = ("mean", "lowest", "spread")
+
+
+@dataclass(frozen=True)
+class TransitionModel:
+    """An ensemble regression on a sample of rated steps.
+
+    Attributes:
+        members: Networks, >= 2.
+        hidden: Width of their two hidden layers.
+        learning_rate: Adam's step size.
+        fits: Minibatches per fit; there is one fit per 2048 environment steps.
+        batch: Rated steps per minibatch.
+        prior_scale: Size of the fixed random functions, in units of the ratings' deviation, > 0.
+        capacity: Rated steps kept.
+    """
+
+    members: int = 5
+    hidden: int = 64
+    learning_rate: float = 1e-3
+    fits: int = 200
+    batch: int = 256
+    prior_scale: float = 0.3
+    capacity: int = 16_384
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        _checks.whole("members", self.members, low=2, high=64)
+        _checks.whole("hidden", self.hidden, low=1, high=4096)
+        _checks.number("learning_rate", self.learning_rate, low=0, high=1, open_low=True)
+        _checks.whole("fits", self.fits, low=1, high=100_000)
+        _checks.whole("batch", self.batch, low=1, high=65_536)
+        _checks.number("prior_scale", self.prior_scale, low=0, open_low=True)
+        _checks.whole("capacity", self.capacity, low=self.batch, high=10_000_000)
+
+
+class Reservoir(NamedTuple):
+    """A uniform sample of the rated steps, on the host; changed in place.
+
+    Attributes:
+        inputs: (M, features) of the steps.
+        heard: (M, len(SAID)).
+        seen: (1,), how many steps were rated so far.
+    """
+
+    inputs: np.ndarray
+    heard: np.ndarray
+    seen: np.ndarray
+
+
+def features(observation: Any, action: Any, following: Any, reward: Any) -> Any:
+    """Return what the model sees of steps: (..., 2 F + D + 1)."""
+    xp = jnp if isinstance(observation, jax.Array) else np
+    return xp.concatenate([observation, action, following - observation, reward[..., None]], -1)
+
+
+def empty(spec: TransitionModel, width: int) -> Reservoir:
+    """Return a reservoir of nothing."""
+    inputs, heard = (np.zeros((spec.capacity, w), np.float32) for w in (width, len(SAID)))
+    return Reservoir(inputs, heard, np.zeros(1, np.int64))
+
+
+def keep(kept: Reservoir, inputs: np.ndarray, ratings: np.ndarray, random: np.random.Generator, ddof: int = 0) -> None:
+    """Put rated steps into the sample [Vitter 1985, algorithm R]; ratings (B, K)."""
+    capacity = len(kept.inputs)
+    spread = ratings.std(1, ddof=ddof) if ratings.shape[1] > 1 else np.zeros(len(ratings))
+    heard = np.stack([ratings.mean(1), ratings.min(1), spread], 1)
+    numbers = kept.seen[0] + np.arange(len(inputs))
+    places = np.where(numbers < capacity, numbers, random.integers(0, numbers + 1))
+    for place, x, y in zip(places, inputs, heard, strict=True):  # in order: a later one may take an earlier's place
+        if place < capacity:
+            kept.inputs[place], kept.heard[place] = x, y
+    kept.seen[0] += len(inputs)
+
+
+class Model(NamedTuple):
+    """Layers, Adam's moments, and the units: location and scale of the inputs, location of what was said, its scale."""
+
+    layers: tuple[Layer, ...]
+    prior: tuple[Layer, ...]
+    optimiser: Any
+    centre: Array
+    width: Array
+    location: Array
+    scale: Array
+
+
+def init(spec: TransitionModel, key: Array, width: int) -> Model:
+    """Draw a fresh model."""
+    own, fixed = jax.random.split(key)
+    layers = mlp(own, (width, spec.hidden, spec.hidden, len(SAID)), spec.members, last_gain=0.1)
+    prior = mlp(fixed, (width, spec.hidden, len(SAID)), spec.members)
+    zeros, ones = jnp.zeros(width, jnp.float32), jnp.ones(width, jnp.float32)
+    location = jnp.zeros(len(SAID), jnp.float32)
+    return Model(layers, prior, optax.adam(spec.learning_rate).init(layers), zeros, ones, location, jnp.float32(1.0))
+
+
+def _predict(spec: TransitionModel, layers: Any, prior: Any, inputs: Array) -> Array:
+    """Return (members, B, len(SAID)), in units of the ratings' deviation."""
+    return through(layers, inputs) + spec.prior_scale * lax.stop_gradient(through(prior, inputs))
+
+
+def _normal(model: Model, inputs: Array) -> Array:
+    return jnp.clip((inputs - model.centre) / model.width, -5.0, 5.0)
+
+
+def read(spec: TransitionModel, model: Model, inputs: Array, raters: int) -> Feedback:
+    """Predict the feedback of steps (B, width); ``proxy`` is the reward that was observed.
+
+    ``count`` is how many ratings the prediction is worth, as in ``feedback.learned``.
+    """
+    x = _normal(model, inputs)
+    out = _predict(spec, model.layers, model.prior, x)
+    before = spec.prior_scale**2 * through(model.prior, x).var(0, ddof=1).mean(-1)
+    after = out.var(0, ddof=1).mean(-1)
+    count = jnp.maximum(before / jnp.maximum(after, 1e-6) - 1.0, 0.0)
+    mean, lowest, spread = jnp.moveaxis(model.location + model.scale * out.mean(0), -1, 0)
+    return Feedback(count, mean, lowest, jnp.maximum(spread, 0.0), inputs[:, -1], jnp.asarray(raters, jnp.float32))
+
+
+@partial(jax.jit, static_argnames="spec")
+def fit(spec: TransitionModel, model: Model, inputs: Array, heard: Array, seen: Array, key: Array) -> Model:
+    """Train for ``fits`` minibatches of the first ``seen`` rows; unchanged before the first."""
+    filled = jnp.minimum(seen, inputs.shape[0])
+    mask = (jnp.arange(inputs.shape[0]) < filled)[:, None]
+    total = jnp.maximum(filled, 1).astype(jnp.float32)
+
+    def moments(x: Array) -> tuple[Array, Array]:
+        centre = jnp.where(mask, x, 0.0).sum(0) / total
+        return centre, jnp.sqrt(jnp.where(mask, (x - centre) ** 2, 0.0).sum(0) / total)
+
+    centre, width = moments(inputs)
+    location, deviation = moments(heard)
+    width = jnp.where(width > 1e-6, width, 1.0)
+    scale = jnp.where(deviation[0] > 1e-6, deviation[0], 1.0)
+    model = model._replace(centre=centre, width=width, location=location, scale=scale)
+
+    def one(carry: tuple[Any, Any], k: Array) -> tuple[tuple[Any, Any], None]:
+        layers, optimiser = carry
+        drawn = jax.random.randint(k, (spec.members, spec.batch), 0, jnp.maximum(filled, 1))
+        x = _normal(model, inputs[drawn])
+        target = (heard[drawn] - location) / scale
+
+        def loss(layers: Any) -> Array:
+            out = _predict(spec, layers, model.prior, x)
+            return optax.losses.huber_loss(out, target).mean((1, 2)).sum()
+
+        return descend(spec.learning_rate, jax.grad(loss)(layers), optimiser, layers), None
+
+    carry, _ = lax.scan(one, (model.layers, model.optimiser), jax.random.split(key, spec.fits))
+    layers, optimiser = jax.tree.map(
+        lambda new, old: jnp.where(filled > 0, new, old), carry, (model.layers, model.optimiser)
+    )
+    return model._replace(layers=layers, optimiser=optimiser)

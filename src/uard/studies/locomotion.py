@@ -1,0 +1,156 @@
+"""Hopper and Walker2d with a reward that lies (H4, H11, H12; G6, G7, G10, G11), in three sizes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from uard.agents.policy import PolicyGradient
+from uard.envs.mujoco import Kick, Locomotion, Posture, Vibration
+from uard.lab.cell import Cell
+from uard.lab.names import continuous_agents
+from uard.lab.study import Row, Study, row
+from uard.mitigation import named
+from uard.studies.paper import PANELS, RAW
+
+REGIONS = {"vibration": Vibration, "posture": Posture}
+RATED = 0.15
+NOISE_UNIT = 4.0  # the paper's noise is in per cent, of what it does not say: of the bonus, here
+
+
+def _cell(environment: Locomotion, mitigation: Any, agent: Any, steps: int, **more: Any) -> Cell:
+    return Cell(environment, mitigation, agent, rated=RATED, steps=steps, **more)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How much of the studies is run.
+
+    Attributes:
+        name: Of the size.
+        steps: Environment steps of the policy family.
+        critic_steps: Of the actor-critic family.
+        small: Whether networks and batches are a CPU's (64, 128) or the published ones (256, 256).
+        names: Of the agents.
+        robots: Which.
+    """
+
+    name: str
+    steps: int
+    critic_steps: int
+    small: bool
+    names: tuple[str, ...]
+    robots: tuple[str, ...] = ("hopper", "walker2d")
+
+    @property
+    def agents(self) -> dict[str, tuple[Any, int]]:
+        """Return agents and their budgets by name."""
+        every = continuous_agents(self.small)
+        return {
+            n: (every[n], self.steps if isinstance(every[n], PolicyGradient) else self.critic_steps) for n in self.names
+        }
+
+
+ALL = tuple(name for name in continuous_agents() if name != "cpo-oracle")
+SMOKE = Scale("smoke", 4_096, 2_560, True, ("ppo", "sac"), ("hopper",))
+STANDARD = Scale("standard", 300_000, 50_000, True, ALL)
+PAPER = Scale("paper", 1_000_000, 1_000_000, False, ALL)
+
+
+def hacking(scale: Scale) -> tuple[Row, ...]:
+    """Raw, as printed and repaired, beside the agent trained on the true reward (B9) and the uncorrupted task."""
+    rows = []
+    for robot in scale.robots:
+        plain = Locomotion(robot, region=None)
+        for name, (agent, steps) in scale.agents.items():
+            for mitigation in ("raw", "uard"):
+                cell = _cell(plain, named(mitigation), agent, steps)
+                rows.append(row(cell, robot=robot, region="none", agent=name, mitigation=mitigation, panel="main"))
+            for which, region in REGIONS.items():
+                lies = Locomotion(robot, region=region())
+                told = Locomotion(robot, region=region(), reference=True)
+                for label, where, mitigation, panel in (
+                    ("true reward", told, RAW, "main"),
+                    ("raw", lies, RAW, "main"),
+                    *((m, lies, named(m), p) for m in ("uard-paper", "uard") for p in PANELS),
+                ):
+                    cell = _cell(where, mitigation, agent, steps, panel=panel)
+                    rows.append(row(cell, robot=robot, region=which, agent=name, mitigation=label, panel=panel))
+    return tuple(rows)
+
+
+def bonuses(scale: Scale) -> tuple[Row, ...]:
+    """How large a bonus breaks which mitigation: 4, 6 and 8, Hopper, PPO."""
+    agent, steps = scale.agents["ppo"]
+    return tuple(
+        row(
+            _cell(Locomotion(region=region(bonus=bonus)), named(mitigation), agent, steps, panel=panel),
+            region=which,
+            bonus=bonus,
+            mitigation=mitigation,
+            panel=panel,
+        )
+        for which, region in REGIONS.items()
+        for bonus in (4.0, 6.0, 8.0)
+        for mitigation in ("uard-operator", "worst-of-annotations", "uard")
+        for panel in PANELS
+    )
+
+
+def noise(scale: Scale) -> tuple[Row, ...]:
+    """Violations against rater noise of 0, 10, 20 and 30 % of the bonus (G11)."""
+    return tuple(
+        row(
+            _cell(Locomotion(), named(mitigation), agent, steps, noise=share * NOISE_UNIT),
+            agent=name,
+            mitigation=mitigation,
+            noise=share,
+        )
+        for name, (agent, steps) in scale.agents.items()
+        if name in ("ppo", "sac")
+        for mitigation in ("raw", "uard")
+        for share in (0.0, 0.1, 0.2, 0.3)
+    )
+
+
+def kick(scale: Scale) -> tuple[Row, ...]:
+    """A state thrown off by +5 at step 500 (G10): one coordinate, and all."""
+    agent, steps = scale.agents["ppo"]
+    return tuple(
+        row(
+            _cell(Locomotion(kick=Kick(coordinate=coordinate)), named(mitigation), agent, steps),
+            mitigation=mitigation,
+            kicked="forward velocity" if coordinate is not None else "all",
+        )
+        for mitigation in ("raw", "uard")
+        for coordinate in (5, None)
+    )
+
+
+def ablation(scale: Scale) -> tuple[Row, ...]:
+    """H8 in its continuous form: which source does the work."""
+    agent, steps = scale.agents["ppo"]
+    variants = {"both": {}, "sigma_h only": {"alpha": 0.0}, "sigma_m only": {"beta": 0.0}}
+    return tuple(
+        row(
+            _cell(Locomotion(region=region()), named("uard", **changes), agent, steps, panel=panel),
+            region=which,
+            variant=variant,
+            panel=panel,
+        )
+        for which, region in REGIONS.items()
+        for variant, changes in variants.items()
+        for panel in PANELS
+    )
+
+
+def studies(scale: Scale) -> tuple[Study, ...]:
+    """Return the studies of a size."""
+    of = f"mujoco-{scale.name}"
+    return (
+        Study(f"{of}-hacking", f"Hacking in MuJoCo, {scale.name}", "H4, G6, G7, J16, J36", hacking(scale)),
+        Study(f"{of}-bonuses", f"Bonuses of 4, 6 and 8, {scale.name}", "DESIGN: what breaks which", bonuses(scale)),
+        Study(f"{of}-noise", f"Violations against noise, {scale.name}", "H11, G11, J25", noise(scale)),
+        Study(f"{of}-kick", f"A kick at step 500, {scale.name}", "H12, G10", kick(scale)),
+        Study(f"{of}-ablation", f"Which source does the work in MuJoCo, {scale.name}", "H8", ablation(scale)),
+    )

@@ -1,0 +1,177 @@
+"""PPO, TRPO and CPO in MuJoCo: a piece of the run is one rollout and its update."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from uard import networks
+from uard.agents import heads
+from uard.agents.policy import Experience
+from uard.envs.mujoco import Moved, Physics
+from uard.feedback import transitions
+from uard.mitigation import Evidence, Feedback
+from uard.training import host
+from uard.training.host import Book, Fixed, Job, Live, Norm
+from uard.training.lanes import LOG
+
+
+def bind(job: Job) -> tuple[Callable[[Physics], Live], host.Advance, Callable[[Live, np.ndarray], np.ndarray]]:
+    """Return how a run starts, how it advances by a rollout, and how its agent acts without exploration."""
+    agent, spec = job.agent, job.spec
+    copies, length = agent.envs, agent.rollout
+    width = 2 * spec.features + spec.actions + 1
+
+    def start(physics: Physics) -> Live:
+        listens = job.listens
+        return Live(
+            agent=agent.init(host.key_of(job.seed, host.INIT), spec.features, spec.actions, continuous=True),
+            norm=Norm.start(spec.features),
+            model=transitions.init(job.feedback, host.key_of(job.seed, host.MODEL), width) if listens else (),
+            reservoir=transitions.empty(job.feedback, width) if listens else (),
+            extra=(),
+            physics=physics.save(),
+            sums=np.zeros((copies, len(LOG))),
+            log=np.zeros((0, len(LOG) + 1)),
+            steps=np.int64(0),
+        )
+
+    def advance(live: Live, physics: Physics) -> Live:
+        number = int(live.steps) // (copies * length)
+        keys = jax.random.split(host.key_of(job.seed, host.ACT, number), length)
+        book = Book(live.sums, int(live.steps))
+        here, actions, steps = [physics.observe()], [], []
+        for t in range(length):
+            action = np.asarray(_act(live.agent, live.norm.of(here[-1]), keys[t]))
+            moved = physics.step(np.clip(action, -1.0, 1.0))
+            book.write(moved)
+            steps.append(moved)
+            actions.append(action)
+            here.append(physics.observe())
+        moved = Moved(*(np.stack(column) for column in zip(*steps, strict=True)))
+        action = np.stack(actions)
+        observation = live.norm.of(np.stack(here[:-1]))
+        following = live.norm.of(moved.observation)
+        # What raters see is what was done: actions within their bounds, in the units of the world.
+        told = transitions.features(
+            np.stack(here[:-1]), np.clip(action, -1.0, 1.0), moved.observation, moved.reward
+        ).astype(np.float32)
+        model, reservoir = live.model, live.reservoir
+        if job.listens:
+            host.record(job, reservoir, steps, told, number)
+            key = host.key_of(job.seed, host.MODEL, number + 1)
+            model = transitions.fit(job.feedback, model, *reservoir[:2], reservoir.seen[0], key)
+        learner, fine = _learn(
+            live.agent,
+            model,
+            reservoir[0] if job.listens else np.zeros((1, width), np.float32),
+            np.asarray(reservoir.seen[0] if job.listens else 0),
+            observation,
+            action,
+            following,
+            told,
+            (moved.reward, moved.hack, moved.terminated, moved.truncated),
+            host.key_of(job.seed, host.LEARN, number),
+            job=job.fixed,
+        )
+        if not fine:
+            raise FloatingPointError("the agent's parameters or its reward left the finite numbers")
+        return Live(
+            agent=learner,
+            norm=live.norm.after(np.concatenate(here[:-1])),
+            model=model,
+            reservoir=reservoir,
+            extra=(),
+            physics=physics.save(),
+            sums=book.sums,
+            log=book.all(live.log),
+            steps=np.int64(book.steps),
+        )
+
+    def act(live: Live, observations: np.ndarray) -> np.ndarray:
+        return np.asarray(heads.likeliest(heads.say(live.agent.policy, jnp.asarray(live.norm.of(observations)))))
+
+    return start, advance, act
+
+
+@jax.jit
+def _act(state: Any, observations: Array, key: Array) -> Array:
+    return heads.draw(heads.say(state.policy, observations), key)
+
+
+def usual_of(mitigation: Any, model_spec: Any, model: Any, kept: Array, seen: Array, raters: int) -> Any:
+    """Return what is usual over the rated steps that were kept."""
+    known = jnp.arange(kept.shape[0]) < seen
+    feedback = transitions.read(model_spec, model, kept, raters)
+    return mitigation.usual(feedback, known & (feedback.count > 0))
+
+
+@partial(jax.jit, static_argnames="job")
+def _learn(
+    state: Any,
+    model: Any,
+    kept: Array,
+    seen: Array,
+    observation: Array,
+    action: Array,
+    following: Array,
+    told: Array,
+    outcome: Any,
+    key: Array,
+    *,
+    job: Fixed,
+) -> tuple[Any, Array]:
+    """Judge a rollout (T, E, ...) and learn from it; also say whether all is finite."""
+    agent, mitigation, model_spec, listens, raters, horizon = job
+    reward, hack, terminated, truncated = (jnp.asarray(x) for x in outcome)
+    reward = reward.astype(jnp.float32)
+    value_key, learn_key = jax.random.split(key)
+    shape = reward.shape
+    total = reward.size
+
+    def flat(x: Array) -> Array:
+        return x.reshape(total, *x.shape[2:])
+
+    both = agent.values(state, jnp.concatenate([flat(observation), flat(following)]), value_key)
+    values, after = both[:, :total], both[:, total:]
+    ahead = jnp.where(flat(terminated), 0.0, agent.gamma * networks.mean_and_deviation(after)[1])
+    if listens:
+        feedback = transitions.read(model_spec, model, flat(told), raters)
+        usual = usual_of(mitigation, model_spec, model, kept, seen, raters)
+    else:
+        nothing = jnp.zeros(total, jnp.float32)
+        feedback = Feedback(nothing, nothing, nothing, nothing, nothing, jnp.asarray(raters, jnp.float32))
+        usual = mitigation.usual(feedback, jnp.zeros(total, bool))
+    signal = mitigation.signal(Evidence(flat(reward), ahead, feedback), usual)
+    alone = feedback._replace(**{n: getattr(feedback, n)[:, None] for n in feedback._fields if n != "raters"})
+
+    def prefer(q: Array) -> Array:
+        return mitigation.score(q.reshape(total, 1), ahead[:, None], alone, usual).reshape(q.shape)
+
+    learned = jnp.asarray(signal.reward, jnp.float32).reshape(shape)
+    lived = Experience(
+        observation=observation,
+        action=action,
+        following=following,
+        reward=learned,
+        weight=jnp.broadcast_to(jnp.asarray(signal.sample_weight, jnp.float32), (total,)).reshape(shape),
+        cost=hack.astype(jnp.float32) if agent.needs_cost else jnp.zeros(shape, jnp.float32),
+        terminated=terminated,
+        done=terminated | truncated,
+        values=values.reshape(-1, *shape),
+        following_values=after.reshape(-1, *shape),
+        horizon=jnp.asarray(horizon),
+        prefer=prefer,
+    )
+    new, watched = agent.update(state, lived, learn_key)
+    fine = jnp.isfinite(watched.loss) & jnp.isfinite(learned).all()
+    for leaf in jax.tree.leaves(new):
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            fine &= jnp.isfinite(leaf).all()
+    return new, fine

@@ -1,0 +1,209 @@
+"""Training in MuJoCo: it learns, it resumes to the bit, it listens to raters, and it stops when it should."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from uard.agents.continuous import ensemble_sac, sac
+from uard.agents.policy import CPO, PPO, TRPO
+from uard.envs.mujoco import Kick, Locomotion, Spikes, Vibration
+from uard.feedback import transitions
+from uard.feedback.transitions import TransitionModel
+from uard.mitigation import named
+from uard.networks import Ensemble, Network
+from uard.training import host
+from uard.training.checkpoint import CheckpointError
+from uard.training.host import Job
+
+TINY = Network(16, 1e-3, 100.0)
+ON = {"network": TINY, "ensemble": Ensemble("shared", 3), "envs": 4, "rollout": 32, "epochs": 2, "count_bonus": 0.0}
+OFF = {"network": Network(16, 1e-3, 1.0), "batch": 32, "warmup": 64, "buffer": 500}
+AGENTS = {
+    "ppo": PPO(**ON),
+    "trpo": TRPO(**ON),
+    "cpo": CPO(**ON),
+    "sac": sac(**OFF),
+    "ensemble-sac": ensemble_sac(3, **OFF),
+}
+LIES = Locomotion("hopper", region=Vibration(shaking=0.5, speed=5.0), spikes=Spikes(0.05), kick=Kick(10))
+SMALL = TransitionModel(hidden=8, fits=5, batch=16, capacity=64)
+
+
+def job(agent, mitigation="uard", steps=1024, **changes):
+    return Job(LIES, AGENTS[agent], named(mitigation), 1, steps, feedback=SMALL, evaluations=2, **changes)
+
+
+def same(a, b):
+    np.testing.assert_array_equal(a.log, b.log)
+    np.testing.assert_array_equal(a.evaluation, b.evaluation)
+    for (place, x), y in zip(jax.tree_util.tree_leaves_with_path(a.live), jax.tree.leaves(b.live), strict=True):
+        np.testing.assert_array_equal(x, y, err_msg=jax.tree_util.keystr(place))
+
+
+@pytest.mark.parametrize(
+    ("agent", "mitigation"),
+    [*((agent, "uard") for agent in AGENTS), ("ppo", "raw"), ("ppo", "uard-paper"), ("sac", "screening")],
+)
+def test_every_agent_runs_with_every_kind_of_mitigation(agent, mitigation):
+    done = host.run(job(agent, mitigation, 256))
+    assert done.live.steps >= 256
+    assert np.isfinite(done.log).all()
+    assert 0 < done.log[:, 4].sum() <= done.live.steps
+    np.testing.assert_allclose(done.ends[-1], done.ends.max())
+
+
+@pytest.mark.parametrize("agent", ["ppo"])
+def test_the_same_seed_gives_the_same_run_and_another_one_another(agent):
+    one = host.run(job(agent))
+    same(one, host.run(job(agent)))
+    assert not np.array_equal(one.log[:5], host.run(replace(job(agent), seed=2)).log[:5])
+
+
+@pytest.mark.parametrize("agent", ["ppo", "ensemble-sac"])
+def test_a_run_that_was_stopped_goes_on_to_the_bit(agent, tmp_path):
+    whole = host.run(job(agent))
+    path, asked = tmp_path / "run", []
+
+    def stop():
+        asked.append(0)
+        return len(asked) == 3
+
+    with pytest.raises(KeyboardInterrupt):
+        host.run(job(agent), path, "it", stop=stop)
+    same(whole, host.run(job(agent), path, "it"))
+    with pytest.raises(CheckpointError, match="another configuration"):
+        host.run(job(agent), path, "something else")
+
+
+@pytest.mark.parametrize("agent", ["ppo", "sac"])
+def test_kill_minus_nine_at_any_moment(agent, tmp_path):
+    script = tmp_path / "run.py"
+    script.write_text(
+        textwrap.dedent(f"""
+        import sys
+        from pathlib import Path
+        sys.path.insert(0, {os.path.dirname(__file__)!r})
+        import numpy as np
+        from test_host import host, job
+        from uard.training.xla import keep_programs
+        keep_programs()
+        done = host.run(job({agent!r}, steps=int(sys.argv[3])), Path(sys.argv[1]), "it", every=32,
+                        progress=lambda a, b: print(a, flush=True))
+        np.savez(sys.argv[2], log=done.log, evaluation=done.evaluation)
+        """)
+    )
+    path, out = tmp_path / "state", tmp_path / "out.npz"
+    steps = 8192 if agent == "ppo" else 2048
+    kills, random = 0, np.random.default_rng(0)
+    while not out.exists():
+        process = subprocess.Popen(
+            [sys.executable, str(script), str(path), str(out), str(steps)], stdout=subprocess.PIPE, text=True
+        )
+        assert process.stdout is not None
+        for _ in range(random.integers(1, 12)):  # after so many pieces of work, and a moment
+            if not process.stdout.readline():
+                break
+        if kills < 3:
+            time.sleep(random.uniform(0, 0.02))
+            process.send_signal(signal.SIGKILL)
+            kills += 1
+        else:
+            process.stdout.read()
+        process.wait()
+        process.stdout.close()
+        assert process.returncode in (0, -signal.SIGKILL)
+    whole = host.run(job(agent, steps=steps))
+    with np.load(out) as found:
+        np.testing.assert_array_equal(found["log"], whole.log)
+        np.testing.assert_array_equal(found["evaluation"], whole.evaluation)
+    assert kills == 3
+
+
+def test_a_state_that_is_not_finite_stops_the_run_and_the_last_good_one_stays(tmp_path, monkeypatch):
+    path = tmp_path / "run"
+    from uard.training import host_on_policy
+
+    real, calls = host_on_policy._learn, []
+
+    def breaks(*args, **kwargs):
+        calls.append(0)
+        state, fine = real(*args, **kwargs)
+        return state, fine & (len(calls) < 4)
+
+    monkeypatch.setattr(host_on_policy, "_learn", breaks)
+    with pytest.raises(host.DivergedError, match=r"environment step 384 of seed 1"):
+        host.run(job("ppo"), path, "it", every=1)
+    monkeypatch.undo()
+    same(host.run(job("ppo")), host.run(job("ppo"), path, "it"))
+
+
+def test_ppo_learns_to_stay_up_on_the_honest_hopper():
+    agent = PPO(
+        Network(64, 3e-4, 100.0), gamma=0.99, rollout=256, epochs=10, minibatches=32, count_bonus=0.0, entropy=0.0
+    )
+    done = host.run(Job(LIES.honest(), agent, named("raw"), 0, 40_000))
+    first, last = done.log[:50], done.log[-50:]
+    assert last[:, 4].mean() > 3 * first[:, 4].mean()
+    assert done.evaluation[:, 1].mean() > 100  # doing nothing falls after about 40 rewards
+
+
+def test_a_reservoir_is_a_uniform_sample_of_all_that_was_rated():
+    kept = transitions.empty(SMALL, 1)
+    random = np.random.default_rng(0)
+    counts = np.zeros(640)
+    for _ in range(200):
+        kept.seen[0] = 0
+        for start in range(0, 640, 32):
+            rows = np.arange(start, start + 32, dtype=float)[:, None]
+            transitions.keep(kept, rows, np.zeros((32, 3)), random)
+        counts[kept.inputs[:, 0].astype(int)] += 1
+    # 200 x 64 of 640 places: 20 each, sd about 4.2
+    assert counts.sum() == 200 * 64
+    assert abs(counts[:64].mean() - 20) < 2
+    assert abs(counts[-64:].mean() - 20) < 2
+
+
+def test_the_model_of_transitions_learns_what_raters_say_and_how_far_that_is_from_the_proxy():
+    random = np.random.default_rng(0)
+    spec = TransitionModel(fits=1500, capacity=2048)
+    x = random.normal(size=(2048, 4)).astype(np.float32)
+    hack = x[:, 0] > 1.0
+    x[:, -1] = x[:, 1] + 4.0 * hack  # the observed reward
+    true = x[:, 1] - 1.5 * hack
+    ratings = true[:, None] + random.normal(size=(2048, 3)) * np.where(hack, 1.0, 0.2)[:, None]
+    kept = transitions.empty(spec, 4)
+    transitions.keep(kept, x, ratings, random)
+    model = transitions.init(spec, jax.random.key(0), 4)
+    model = transitions.fit(spec, model, *kept[:2], kept.seen[0], jax.random.key(1))
+    said = transitions.read(spec, model, jax.numpy.asarray(x), 3)
+    assert np.sqrt(np.mean((np.asarray(said.mean) - true) ** 2)) < 0.25
+    assert np.asarray(said.spread)[hack].mean() > 3 * np.asarray(said.spread)[~hack].mean()
+
+
+def test_the_model_of_transitions_knows_where_nobody_rated():
+    random = np.random.default_rng(0)
+    spec = TransitionModel(fits=1500, capacity=2048)
+    x = random.normal(size=(2048, 4)).astype(np.float32)
+    rated, never = x[:, 0] < 0.5, x[:, 0] > 1.0
+    kept = transitions.empty(spec, 4)
+    transitions.keep(kept, x[rated], x[rated, 1:2] + random.normal(size=(rated.sum(), 3)) * 0.2, random)
+    model = transitions.init(spec, jax.random.key(0), 4)
+    model = transitions.fit(spec, model, *kept[:2], kept.seen[0], jax.random.key(1))
+    count = np.asarray(transitions.read(spec, model, jax.numpy.asarray(x), 3).count)
+    assert np.median(count[never]) < 0.2 * np.median(count[rated])
+
+
+def test_without_ratings_the_model_stays_as_it_was():
+    model = transitions.init(SMALL, jax.random.key(0), 3)
+    kept = transitions.empty(SMALL, 3)
+    after = transitions.fit(SMALL, model, *kept[:2], kept.seen[0], jax.random.key(1))
+    for a, b in zip(jax.tree.leaves(model.layers), jax.tree.leaves(after.layers), strict=True):
+        np.testing.assert_array_equal(a, b)

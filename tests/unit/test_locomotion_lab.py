@@ -1,0 +1,100 @@
+"""Hopper and Walker2d in the laboratory: cells, names, studies, checkpoints beside the store."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from uard._checks import InvalidValueError
+from uard.agents.continuous import ensemble_sac
+from uard.agents.policy import PPO
+from uard.agents.tabular import QLearning
+from uard.envs.mujoco import Locomotion, Vibration
+from uard.envs.trapgrid import TrapGrid
+from uard.feedback.learned import RatingModel
+from uard.feedback.transitions import TransitionModel
+from uard.lab import names, runner
+from uard.lab.cell import Cell
+from uard.lab.store import Store
+from uard.mitigation import Raw, named
+from uard.networks import Ensemble, Network
+from uard.studies import locomotion
+
+TINY = PPO(Network(16, 1e-3, 100.0), Ensemble("shared", 3), envs=4, rollout=32, epochs=1, count_bonus=0.0)
+WHERE = Locomotion("hopper", region=Vibration(shaking=0.5, speed=5.0))
+
+
+def cell(**changes):
+    return Cell(**({"environment": WHERE, "mitigation": named("uard"), "agent": TINY, "steps": 512} | changes))
+
+
+def test_a_cell_knows_what_matters_of_it():
+    assert cell(feedback=TransitionModel()).key == cell().key
+    assert cell(episodes=7).key == cell().key, "episodes mean nothing here"
+    assert cell(steps=513).key != cell().key
+    assert cell(steps=None).steps == 1_000_000
+    assert cell(environment=dataclasses.replace(WHERE, version=5)).key != cell().key
+    raw = cell(mitigation=Raw(), panel="appendix", rated=0.5)
+    assert raw.key == cell(mitigation=Raw()).key, "nobody is asked"
+    assert "steps" not in Cell().config(), "keys of the grids' cells are what they were"
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"agent": QLearning()}, "continuous: ppo, trpo"),
+        ({"agent": names.AGENTS["dqn"]}, "ppo, trpo"),
+        ({"environment": TrapGrid(), "agent": ensemble_sac(), "steps": None}, "discrete: q-learning"),
+        ({"environment": TrapGrid(), "agent": QLearning(), "steps": 10}, "episodes"),
+        ({"feedback": RatingModel()}, "TransitionModel"),
+        ({"steps": 0}, "steps"),
+    ],
+)
+def test_pairs_that_cannot_work_are_refused_with_those_that_can(changes, says):
+    with pytest.raises(InvalidValueError, match=says):
+        cell(**changes)
+
+
+def test_every_continuous_agent_has_the_network_of_its_family():
+    for small in (False, True):
+        agents = names.continuous_agents(small)
+        policy = [a for a in agents.values() if isinstance(a, names.PolicyGradient)]
+        critic = [a for a in agents.values() if not isinstance(a, names.PolicyGradient)]
+        assert len(policy) == 4
+        assert len(critic) == 5
+        for family in (policy, critic):
+            assert len({a.network for a in family}) == 1
+            assert len({a.gamma for a in family}) == 1
+        assert len({(a.batch, a.buffer, a.warmup) for a in critic}) == 1
+
+
+def test_a_run_is_stored_its_checkpoint_is_gone_and_another_process_gives_the_same(tmp_path):
+    store = Store(tmp_path / "s.sqlite")
+    jobs = [(cell(), s) for s in range(2)]
+    assert runner.run(jobs, store, workers=2) == 2
+    assert list((tmp_path / "s.sqlite-checkpoints").glob("*")) == []
+    found = store.get(cell(), [0, 1])
+    here = runner.train_batch([jobs[0]])[0]
+    np.testing.assert_array_equal(found[0].log, here.log)
+    np.testing.assert_array_equal(found[0].extra["evaluation"], here.extra["evaluation"])
+    assert found[0].steps == 512
+    assert not np.array_equal(found[0].log[:5], found[1].log[:5])
+    assert set(found[0].metrics()) >= {"trap_visits", "true_return"}
+
+
+def test_a_truncated_checkpoint_fails_its_run_with_what_to_do_and_no_other(tmp_path):
+    store = Store(tmp_path / "s.sqlite")
+    bad = runner.checkpoint_of(tmp_path / "s.sqlite-checkpoints", cell(), 0)
+    bad.parent.mkdir()
+    bad.write_bytes(b"uard checkpoint 1\nhalf")
+    with pytest.raises(runner.StudyFailedError, match="truncated; delete"):
+        runner.run([(cell(), 0), (cell(), 1)], store, workers=1)
+    assert store.missing(cell(), [0, 1]) == [0]
+
+
+def test_studies_of_all_sizes_are_the_same_questions():
+    sizes = [locomotion.studies(s) for s in (locomotion.SMOKE, locomotion.STANDARD, locomotion.PAPER)]
+    assert len({tuple(s.answers for s in studies) for studies in sizes}) == 1
+    assert {r.cell.steps for s in sizes[2] for r in s.rows} == {1_000_000}
+    agents = {r["agent"] for s in sizes[1] for r in s.rows if s.name.endswith("hacking")}
+    assert agents == set(names.CONTINUOUS) - {"cpo-oracle"}
