@@ -188,11 +188,12 @@ def test_the_model_of_transitions_learns_what_raters_say_and_how_far_that_is_fro
     assert np.asarray(said.spread)[hack].mean() > 3 * np.asarray(said.spread)[~hack].mean()
 
 
-def test_the_model_of_transitions_knows_where_nobody_rated():
+def test_the_model_of_transitions_knows_that_nobody_rated_a_step_with_such_a_bonus():
     random = np.random.default_rng(0)
     spec = TransitionModel(fits=1500, capacity=2048)
     x = random.normal(size=(2048, 4)).astype(np.float32)
     rated, never = x[:, 0] < 0.5, x[:, 0] > 1.0
+    x[:, -1] = x[:, 1] + 4.0 * never
     kept = transitions.empty(spec, 4)
     transitions.keep(kept, x[rated], x[rated, 1:2] + random.normal(size=(rated.sum(), 3)) * 0.2, random)
     model = transitions.init(spec, jax.random.key(0), 4)
