@@ -51,7 +51,7 @@ class Robot:
         angle: Healthy pitch of the torso.
         bound: Healthy size of every state variable but the position; None does not look.
         acceleration: Root mean square of the joints' accelerations under random actions, rad/s^2; measured by
-            ``benchmarks/mujoco.py``.
+            ``benchmarks/locomotion.py``.
     """
 
     xml: dict[int, str]

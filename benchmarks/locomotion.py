@@ -1,6 +1,6 @@
 """How fast is training in MuJoCo? Side by side in one run: physics, SAC's updates, PPO's steps.
 
-    python benchmarks/mujoco.py [--rounds 3] [--only physics sac ppo] [--json FILE]
+    python benchmarks/locomotion.py [--rounds 3] [--only physics sac ppo] [--json FILE]
 
 Physics: copies stepped by Gymnasium's SyncVectorEnv and by ours, per robot, with one thread and with one per core.
 SAC: updates per second of SBX (where it is installed), Stable-Baselines3 and ours with networks of 256x256 and batches
@@ -267,7 +267,7 @@ def main() -> None:
         wanted = ("uard", "jax", "mujoco", "gymnasium", "stable-baselines3", "torch", "sbx-rl")
         packages = {p: metadata.version(p) for p in wanted if p != "sbx-rl" or util.find_spec("sbx")}
         made = {
-            "command": f"python benchmarks/mujoco.py --rounds {arguments.rounds}",
+            "command": f"python benchmarks/locomotion.py --rounds {arguments.rounds}",
             "machine": f"{platform.machine()}, {os.cpu_count()} cores",
             "packages": packages | {"python": platform.python_version()},
         }
