@@ -47,6 +47,11 @@ class Feedback(NamedTuple):
     raters: Array
 
 
+def as_column(feedback: Feedback) -> Feedback:
+    """Return the feedback of (B,) steps as that of states with one action each, (B, 1)."""
+    return Feedback._make([*(x[:, None] for x in feedback[:5]), feedback.raters])
+
+
 class Evidence(NamedTuple):
     """All that a mitigation may know of a step: observed reward, ensemble disagreement, feedback."""
 

@@ -23,7 +23,7 @@ import optax
 from jax import Array, lax
 
 from uard import _checks, networks
-from uard.agents.actor_critic import LOG_TEMPERATURES, gradient_similarity, polyak, temperature_loss
+from uard.agents.actor_critic import LOG_TEMPERATURES, Trained, gradient_similarity, polyak, temperature_loss
 from uard.agents.heads import HALF_LOG_TAU, Normal
 from uard.agents.off_policy import Judge, Watched
 from uard.agents.value import backup_weight
@@ -214,14 +214,6 @@ class ContinuousActorCritic:
         values = jax.vmap(lambda a: self._values(weights, batch.observation, a))(offered)
         soft = jax.nn.logsumexp(values - density[:, None], 0) - math.log(2.0 * CQL_ACTIONS)
         return soft - q
-
-
-class Trained(NamedTuple):
-    """What Adam moves: the critics' layers, the actor's, the log of the temperature."""
-
-    critics: tuple[Layer, ...]
-    actor: tuple[Layer, ...]
-    log_temperature: Array
 
 
 class State(NamedTuple):

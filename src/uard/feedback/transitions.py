@@ -19,7 +19,7 @@ import optax
 from jax import Array, lax
 
 from uard import _checks
-from uard.mitigation import Feedback
+from uard.mitigation import Feedback, Mitigation
 from uard.networks import Layer, descend, mlp, through
 
 SAID = ("mean", "lowest", "spread")
@@ -140,6 +140,20 @@ def read(spec: TransitionModel, model: Model, inputs: Array, raters: int) -> Fee
     count = jnp.maximum(before / jnp.maximum(after, 1e-6) - 1.0, 0.0)
     mean, lowest, spread = jnp.moveaxis(model.location + model.scale * out.mean(0), -1, 0)
     return Feedback(count, mean, lowest, jnp.maximum(spread, 0.0), inputs[:, -1], jnp.asarray(raters, jnp.float32))
+
+
+def nothing(rows: int, raters: int) -> Feedback:
+    """Return the feedback of steps that nobody was asked about."""
+    zeros = jnp.zeros(rows, jnp.float32)
+    return Feedback(zeros, zeros, zeros, zeros, zeros, jnp.asarray(raters, jnp.float32))
+
+
+def usual(mitigation: Mitigation, spec: TransitionModel, model: Any, kept: Array, seen: Array, raters: int) -> Any:
+    """Return what is usual over the rated steps that were kept; ``model`` () was never asked."""
+    if model == ():
+        return mitigation.usual(nothing(1, raters), jnp.zeros(1, bool))
+    feedback = read(spec, model, kept, raters)
+    return mitigation.usual(feedback, (jnp.arange(kept.shape[0]) < seen) & (feedback.count > 0))
 
 
 @partial(jax.jit, static_argnames="spec")

@@ -234,9 +234,9 @@ class Watch(NamedTuple):
                 jnp.asarray(True),
                 ~jnp.isfinite(loss),
                 ~(largest <= EXPLODED * unit),
-                ~_all_finite(agent),
-                ~_all_finite(model),
-                ~_all_finite(reward),
+                ~all_finite(agent),
+                ~all_finite(model),
+                ~all_finite(reward),
             ]
         )
         # The reward first: it is the cause of what follows it.
@@ -247,7 +247,8 @@ class Watch(NamedTuple):
         return Watch(fault, jnp.where(fine, 0, steps), good, jnp.where(fine, steps, self.good_step))
 
 
-def _all_finite(tree: Any) -> Array:
+def all_finite(tree: Any) -> Array:
+    """Whether all floats of a pytree are finite."""
     floats = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating)]
     return jnp.all(jnp.stack([jnp.isfinite(x).all() for x in floats])) if floats else jnp.asarray(True)
 

@@ -14,7 +14,7 @@ from jax import Array, lax
 from uard.agents.continuous import Batch, ContinuousActorCritic
 from uard.envs.mujoco import Physics
 from uard.feedback import transitions
-from uard.mitigation import Evidence, Feedback
+from uard.mitigation import Evidence, as_column
 from uard.training import host
 from uard.training.host import Book, Fixed, Job, Live, Norm
 from uard.training.lanes import LOG
@@ -110,7 +110,7 @@ def bind(job: Job) -> tuple[Callable[[Physics], Live], host.Advance, Callable[[L
             job=fixed,
             learns=done + PIECE > agent.warmup,
         )
-        if number % FIT_EVERY == 0 and not fine:
+        if not fine:
             raise FloatingPointError("the agent's parameters or its values left the finite numbers")
         return live._replace(
             agent=learner,
@@ -139,17 +139,7 @@ def _act(state: Any, observation: Array, key: Array, *, agent: ContinuousActorCr
 
 @partial(jax.jit, static_argnames="job")
 def _usual(model: Any, kept: Array, seen: Array, *, job: Fixed) -> Any:
-    """Return what is usual over the rated steps that were kept."""
-    _, mitigation, model_spec, listens, raters, _ = job
-    if not listens:
-        return mitigation.usual(_silence(1, raters), jnp.zeros(1, bool))
-    feedback = transitions.read(model_spec, model, kept, raters)
-    return mitigation.usual(feedback, (jnp.arange(kept.shape[0]) < seen) & (feedback.count > 0))
-
-
-def _silence(rows: int, raters: int) -> Feedback:
-    nothing = jnp.zeros(rows, jnp.float32)
-    return Feedback(nothing, nothing, nothing, nothing, nothing, jnp.asarray(raters, jnp.float32))
+    return transitions.usual(job.mitigation, job.feedback, model, kept, seen, job.raters)
 
 
 @partial(jax.jit, static_argnames=("job", "learns"), donate_argnums=(0, 1))
@@ -182,8 +172,8 @@ def _learn(
             told = transitions.features(drawn.observation, drawn.action, drawn.following, drawn.reward)
             feedback = transitions.read(model_spec, model, told, raters)
         else:
-            feedback = _silence(agent.batch, raters)
-        alone = feedback._replace(**{n: getattr(feedback, n)[:, None] for n in feedback._fields if n != "raters"})
+            feedback = transitions.nothing(agent.batch, raters)
+        alone = as_column(feedback)
 
         def judge(sigma: Array) -> Any:
             return mitigation.signal(Evidence(drawn.reward, sigma, feedback), usual)

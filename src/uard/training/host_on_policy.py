@@ -16,8 +16,9 @@ from uard.agents import heads
 from uard.agents.policy import Experience
 from uard.envs.mujoco import Moved, Physics
 from uard.feedback import transitions
-from uard.mitigation import Evidence, Feedback
+from uard.mitigation import Evidence, as_column
 from uard.training import host
+from uard.training.deep import all_finite
 from uard.training.host import Book, Fixed, Job, Live, Norm
 from uard.training.lanes import LOG
 
@@ -105,13 +106,6 @@ def _act(state: Any, observations: Array, key: Array) -> Array:
     return heads.draw(heads.say(state.policy, observations), key)
 
 
-def usual_of(mitigation: Any, model_spec: Any, model: Any, kept: Array, seen: Array, raters: int) -> Any:
-    """Return what is usual over the rated steps that were kept."""
-    known = jnp.arange(kept.shape[0]) < seen
-    feedback = transitions.read(model_spec, model, kept, raters)
-    return mitigation.usual(feedback, known & (feedback.count > 0))
-
-
 @partial(jax.jit, static_argnames="job")
 def _learn(
     state: Any,
@@ -141,15 +135,13 @@ def _learn(
     both = agent.values(state, jnp.concatenate([flat(observation), flat(following)]), value_key)
     values, after = both[:, :total], both[:, total:]
     ahead = jnp.where(flat(terminated), 0.0, agent.gamma * networks.mean_and_deviation(after)[1])
+    usual = transitions.usual(mitigation, model_spec, model, kept, seen, raters)
     if listens:
         feedback = transitions.read(model_spec, model, flat(told), raters)
-        usual = usual_of(mitigation, model_spec, model, kept, seen, raters)
     else:
-        nothing = jnp.zeros(total, jnp.float32)
-        feedback = Feedback(nothing, nothing, nothing, nothing, nothing, jnp.asarray(raters, jnp.float32))
-        usual = mitigation.usual(feedback, jnp.zeros(total, bool))
+        feedback = transitions.nothing(total, raters)
     signal = mitigation.signal(Evidence(flat(reward), ahead, feedback), usual)
-    alone = feedback._replace(**{n: getattr(feedback, n)[:, None] for n in feedback._fields if n != "raters"})
+    alone = as_column(feedback)
 
     def prefer(q: Array) -> Array:
         return mitigation.score(q.reshape(total, 1), ahead[:, None], alone, usual).reshape(q.shape)
@@ -170,8 +162,4 @@ def _learn(
         prefer=prefer,
     )
     new, watched = agent.update(state, lived, learn_key)
-    fine = jnp.isfinite(watched.loss) & jnp.isfinite(learned).all()
-    for leaf in jax.tree.leaves(new):
-        if jnp.issubdtype(leaf.dtype, jnp.floating):
-            fine &= jnp.isfinite(leaf).all()
-    return new, fine
+    return new, all_finite((watched.loss, learned, new))

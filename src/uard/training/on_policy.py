@@ -16,7 +16,7 @@ from jax import Array, lax
 from uard import networks
 from uard.agents.policy import Experience, PolicyGradient
 from uard.envs.world import Step
-from uard.mitigation import Evidence
+from uard.mitigation import Evidence, as_column
 from uard.training import deep
 from uard.training.deep import CHUNK, FeedbackSource, Lane, Outcome, Program
 from uard.training.lanes import LOG
@@ -100,7 +100,7 @@ def run(one: Lane, program: Program) -> Outcome:
         signal = mitigation.signal(Evidence(after.reward, jnp.hypot(ahead, after.doubt), feedback), usual)
         slots = jax.vmap(world.slot)(flat.state, flat.action)
         bonus = agent.count_bonus / jnp.sqrt(c.visits[slots])
-        alone = feedback._replace(**{n: getattr(feedback, n)[:, None] for n in feedback._fields if n != "raters"})
+        alone = as_column(feedback)
 
         def prefer(q: Array) -> Array:
             scores = mitigation.score(q.reshape(total, 1), ahead[:, None], alone, usual)
