@@ -53,7 +53,7 @@ class Scale:
 
 ALL = tuple(name for name in continuous_agents() if name != "cpo-oracle")
 SMOKE = Scale("smoke", 4_096, 2_560, True, ("ppo", "sac"), ("hopper",))
-STANDARD = Scale("standard", 300_000, 50_000, True, ALL)
+STANDARD = Scale("standard", 150_000, 50_000, True, ALL)
 PAPER = Scale("paper", 1_000_000, 1_000_000, False, ALL)
 
 
