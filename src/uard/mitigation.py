@@ -283,15 +283,18 @@ class RewardDiscounting(Mitigation):
         one = namespace(weight).ones_like(weight)
         return weight * uncertainty.shrink(one, feedback.count, self.unrated_weight, self.prior_count)
 
+    def reward_anchor(self, reward: Array, feedback: Feedback, usual: Usual) -> Array:
+        """Return b, what a reward is drawn towards."""
+        if self.anchor == "zero":
+            return 0.0 * reward
+        return uncertainty.shrink(feedback.lowest, feedback.count, usual.lowest, self.prior_count)
+
     def signal(self, evidence: Evidence, usual: Usual) -> LearningSignal:
         """Return b + w (r - b), or the observed reward if only scores are discounted."""
         f, r = evidence.feedback, evidence.reward
         if self.acts_on == "score":
             return LearningSignal(r, 1.0)
-        if self.anchor == "zero":
-            anchor = 0.0 * r
-        else:
-            anchor = uncertainty.shrink(f.lowest, f.count, usual.lowest, self.prior_count)
+        anchor = self.reward_anchor(r, f, usual)
         return LearningSignal(discount(r, self.weight(r - anchor, r, evidence.sigma_m, f, usual), anchor), 1.0)
 
     def score(self, mu: Array, sigma_m: Array, feedback: Feedback, usual: Usual) -> Array:
