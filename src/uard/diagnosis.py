@@ -15,6 +15,7 @@ rated was rated often enough: the pseudo-count with which ``uard`` meets the fir
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -179,11 +180,12 @@ class _Case(NamedTuple):
         ratings: Their ratings, NaN where one is missing.
         sigma_m: The ensemble's disagreement, or None.
         true: What they were really worth, NaN where unknown, or None.
-        item: Number of each row's item, or None.
         feedback: What is known of each row's item.
+        distinct: What is known of every distinct item.
         rated: Whether that is anything.
         unit: Standard deviation of the rewards.
-        noise: How far the mean of a row's ratings may be from what raters mean: four of its usual standard errors.
+        noise: How far the mean of a row's ratings may be from what raters mean: so many of its usual standard errors
+            that of all rows hardly one gets there by chance.
         mine: The filter that is going to be used.
         printed: The filter as printed.
         advised: The filter that we recommend.
@@ -195,8 +197,8 @@ class _Case(NamedTuple):
     ratings: np.ndarray
     sigma_m: np.ndarray | None
     true: np.ndarray | None
-    item: np.ndarray | None
     feedback: Feedback
+    distinct: Feedback
     rated: np.ndarray
     unit: float
     noise: float
@@ -236,13 +238,13 @@ def _case(log: RatingLog, name: str, method: RewardDiscounting) -> _Case:
     sigma_m = None if log.sigma_m is None else np.where(_usable(log.sigma_m), log.sigma_m, 0.0)[rows]
     true = None if log.true_reward is None else np.where(_usable(log.true_reward), log.true_reward, np.nan)[rows]
     item = None if log.item is None else np.unique(log.item[rows], return_inverse=True)[1]
-    heard, _ = _feedback(reward, ratings, item)
+    heard, distinct = _feedback(reward, ratings, item)
     several = heard.raters >= 2
     error = heard.spread[several] / np.sqrt(np.maximum(heard.raters[several] - 1.0, 1.0))
     deviation = float(reward.std())
 
     def outcome(name: str, method: RewardDiscounting) -> _Outcome:
-        return _Outcome(name, method, *_filtered(method, reward, ratings, sigma_m, item))
+        return _Outcome(name, method, *_filtered(method, reward, sigma_m, heard, distinct))
 
     return _Case(
         log,
@@ -251,11 +253,11 @@ def _case(log: RatingLog, name: str, method: RewardDiscounting) -> _Case:
         ratings,
         sigma_m,
         true,
-        item,
         heard,
+        distinct,
         heard.count > 0,
         deviation if deviation > 1e-12 * np.abs(reward).max() else 1.0,
-        4.0 * float(np.median(error)) if error.size else 0.0,
+        1.5 * math.sqrt(2.0 * math.log(error.size)) * float(np.median(error)) if error.size else 0.0,
         outcome(name, method),
         outcome(PRINTED, _named(PRINTED)),
         outcome("uard", _named("uard")),
@@ -289,14 +291,9 @@ def _feedback(reward: np.ndarray, ratings: np.ndarray, item: np.ndarray | None) 
 
 
 def _filtered(
-    method: RewardDiscounting,
-    reward: np.ndarray,
-    ratings: np.ndarray,
-    sigma_m: np.ndarray | None,
-    item: np.ndarray | None,
+    method: RewardDiscounting, reward: np.ndarray, sigma_m: np.ndarray | None, heard: Feedback, distinct: Feedback
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return every row's weight and the reward that would be learned from."""
-    heard, distinct = _feedback(reward, ratings, item)
     sigma_m = np.zeros_like(reward) if sigma_m is None else sigma_m
     method = replace(method, prior_count=0.0)
     usual = measure_usual(distinct, distinct.count > 0, method.proxy_is_rater)
@@ -307,8 +304,14 @@ def _filtered(
 
 def _moved(case: _Case, method: RewardDiscounting, shift: float, factor: float) -> np.ndarray:
     """Return what would be learned from if all rewards and ratings were multiplied, then shifted."""
+
+    def moved(f: Feedback) -> Feedback:
+        mean, lowest, proxy = (factor * x + shift for x in (f.mean, f.lowest, f.proxy))
+        return Feedback(f.count, mean, lowest, factor * f.spread, proxy, f.raters)
+
     sigma_m = None if case.sigma_m is None else factor * case.sigma_m
-    return _filtered(method, factor * case.reward + shift, factor * case.ratings + shift, sigma_m, case.item)[1]
+    heard, distinct = moved(case.feedback), moved(case.distinct)
+    return _filtered(method, factor * case.reward + shift, sigma_m, heard, distinct)[1]
 
 
 def _pairs(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

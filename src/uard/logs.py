@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -115,7 +116,8 @@ def read(path: str | Path, reward: str = "reward", ratings: Sequence[str] | None
     try:
         columns = {"CSV": _csv, "JSONL": _jsonl, "Parquet": _parquet}[kind](path, wanted)
     except OSError as error:
-        raise _checks.InvalidValueError("log", str(path), f"a file that can be read ({error.strerror})") from None
+        why = os.strerror(error.errno) if error.errno else error
+        raise _checks.InvalidValueError("log", str(path), f"a file that can be read ({why})") from None
     except UnicodeDecodeError as error:
         raise _checks.InvalidValueError(
             "log", str(path), f"UTF-8 text (byte {error.start}: {error.object[error.start : error.start + 1]!r})"
@@ -289,10 +291,10 @@ def _csv(path: Path, wanted: _Wanted) -> dict[str, Any]:
         parts: dict[str, list[Any]] = {n: [] for _, n in places}
         start = 0
         for rows in _chunks(csv.reader(file, delimiter=separator), path):
-            for i, row in enumerate(rows):
-                if len(row) != len(names):
-                    allowed = f"{len(names)} cells, as the header has"
-                    raise _checks.InvalidValueError(f"{path}: row {start + i + 1}", separator.join(row), allowed)
+            if set(map(len, rows)) != {len(names)}:
+                i = next(i for i, row in enumerate(rows) if len(row) != len(names))
+                allowed = f"{len(names)} cells, as the header has"
+                raise _checks.InvalidValueError(f"{path}: row {start + i + 1}", separator.join(rows[i]), allowed)
             for place, name in places:
                 cells = [row[place] for row in rows]
                 parts[name].append(cells if name in LABELS else _parsed(cells, start, name, str(path)))
@@ -318,7 +320,7 @@ def _chunks(reader: Iterator[list[str]], path: Path) -> Iterator[list[list[str]]
 
 def _parsed(cells: list[str], start: int, column: str, source: str) -> np.ndarray:
     try:
-        return np.array(list(map(float, cells)))
+        return np.array([float(cell or "nan") for cell in cells])
     except ValueError:
         return np.array([_from_text(cell, start + i, column, source) for i, cell in enumerate(cells)])
 
@@ -338,44 +340,51 @@ def _no_binary(text: str, path: Path) -> None:
 
 
 def _jsonl(path: Path, wanted: _Wanted) -> dict[str, Any]:
-    columns: dict[str, list[Any]] = {}
-    row, others = 0, dict[str, None]()
+    columns: dict[tuple[str, int | None], list[Any]] = {}
+    others: set[str] = set()
+    row = 0
+
+    def put(name: str, part: int | None, cell: Any) -> None:
+        column = columns.get((name, part))
+        if column is None:
+            if not wanted.has(name):
+                others.add(name)
+                return
+            column = columns[name, part] = [None] * row
+        column.extend([None] * (row - len(column)))
+        column.append(cell)
+
     with path.open(encoding="utf-8-sig") as file:
         for line in file:
-            if not line.strip():
+            if line.isspace():
                 continue
-            _no_binary(line, path)
-            try:
-                entry = json.loads(line)
-            except (json.JSONDecodeError, RecursionError) as error:
-                raise _checks.InvalidValueError(f"{path}: row {row + 1}", line.strip(), f"JSON ({error})") from None
-            if not isinstance(entry, dict):
-                raise _checks.InvalidValueError(f"{path}: row {row + 1}", entry, "a JSON object")
-            if wanted.reward not in entry:
-                raise _checks.UnknownNameError(f"{path}: row {row + 1}, column", wanted.reward, entry)
-            for name, value in _flat(entry):
-                if not wanted.has(name):
-                    others[name] = None
-                    continue
-                column = columns.setdefault(name, [])
-                column.extend([None] * (row - len(column)))
-                column.append(value)
+            for name, value in _entry(line, row, path, wanted.reward).items():
+                if isinstance(value, list):
+                    for part, cell in enumerate(value):
+                        put(name, part, cell)
+                else:
+                    put(name, None, value)
             row += 1
     if not row:
         raise _checks.InvalidValueError("log", str(path), "a JSONL file with at least one row")
     for column in columns.values():
         column.extend([None] * (row - len(column)))
-    wanted.check([*columns, *others])
-    return columns
+    named = {name if part is None else f"{name}[{part}]": column for (name, part), column in columns.items()}
+    wanted.check([*named, *others])
+    return named
 
 
-def _flat(entry: Mapping[str, Any]) -> Iterable[tuple[str, Any]]:
-    """Yield names and values; a list under ``ratings`` becomes ``ratings[0]``, ``ratings[1]``, ..."""
-    for name, value in entry.items():
-        if isinstance(value, list):
-            yield from ((f"{name}[{i}]", x) for i, x in enumerate(value))
-        else:
-            yield name, value
+def _entry(line: str, row: int, path: Path, reward: str) -> dict[str, Any]:
+    _no_binary(line, path)
+    try:
+        entry = json.loads(line)
+    except (ValueError, RecursionError) as error:
+        raise _checks.InvalidValueError(f"{path}: row {row + 1}", line.strip(), f"JSON ({error})") from None
+    if not isinstance(entry, dict):
+        raise _checks.InvalidValueError(f"{path}: row {row + 1}", entry, "a JSON object")
+    if reward not in entry:
+        raise _checks.UnknownNameError(f"{path}: row {row + 1}, column", reward, entry)
+    return entry
 
 
 def _parquet(path: Path, wanted: _Wanted) -> dict[str, Any]:
