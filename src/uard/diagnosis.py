@@ -143,12 +143,8 @@ def doctor(
     elif not isinstance(log, RatingLog):
         log = logs.from_columns(log, reward, ratings)
     name = mitigation if isinstance(mitigation, str) else "your filter"
-    method = named(mitigation) if isinstance(mitigation, str) else mitigation
-    if not isinstance(method, RewardDiscounting):
-        raise _checks.InvalidValueError("mitigation", mitigation, "a form of the filter (uard, uard-operator, ...)")
-    broken = _not_finite(log)
-    case = _case(log, name, method)
-    found = [broken, *(check(case) for check in CHECKS)]
+    case = _case(log, name, _method(mitigation))
+    found = [_not_finite(log), *(check(case) for check in CHECKS)]
     return Diagnosis(
         log.source,
         name if isinstance(mitigation, str) else repr(mitigation),
@@ -159,6 +155,34 @@ def doctor(
         _calibration(case),
         tuple(sorted((f for f in found if f is not None), key=lambda f: SEVERITIES.index(f.severity))),
     )
+
+
+def filtered(log: RatingLog, mitigation: str | RewardDiscounting = "uard") -> np.ndarray:
+    """Return the reward to learn from of every row of a log, (n,): what the doctor looks at.
+
+    Args:
+        log: A log whose rewards and ratings are finite; missing ratings are NaN.
+        mitigation: A form of the filter, by name or itself.
+
+    Raises:
+        InvalidValueError: a reward is NaN or infinite, a rating or sigma_m is infinite (the message names the row), or
+            the mitigation is no reliability filter.
+    """
+    _checks.finite("reward", log.reward)
+    _checks.finite("ratings", np.where(np.isnan(log.ratings), 0.0, log.ratings))
+    heard, distinct = _feedback(log.reward, log.ratings, _numbered(log.item))
+    return _filtered(_method(mitigation), log.reward, log.sigma_m, heard, distinct)[1]
+
+
+def _method(mitigation: str | RewardDiscounting) -> RewardDiscounting:
+    method = named(mitigation) if isinstance(mitigation, str) else mitigation
+    if not isinstance(method, RewardDiscounting):
+        raise _checks.InvalidValueError("mitigation", mitigation, "a form of the filter (uard, uard-operator, ...)")
+    return method
+
+
+def _numbered(item: np.ndarray | None) -> np.ndarray | None:
+    return None if item is None else np.unique(item, return_inverse=True)[1]
 
 
 class _Outcome(NamedTuple):
@@ -237,7 +261,7 @@ def _case(log: RatingLog, name: str, method: RewardDiscounting) -> _Case:
     reward, ratings = log.reward[rows], np.where(_usable(log.ratings[rows]), log.ratings[rows], np.nan)
     sigma_m = None if log.sigma_m is None else np.where(_usable(log.sigma_m), log.sigma_m, 0.0)[rows]
     true = None if log.true_reward is None else np.where(_usable(log.true_reward), log.true_reward, np.nan)[rows]
-    item = None if log.item is None else np.unique(log.item[rows], return_inverse=True)[1]
+    item = None if log.item is None else _numbered(log.item[rows])
     heard, distinct = _feedback(reward, ratings, item)
     several = heard.raters >= 2
     error = heard.spread[several] / np.sqrt(np.maximum(heard.raters[several] - 1.0, 1.0))
@@ -259,15 +283,9 @@ def _case(log: RatingLog, name: str, method: RewardDiscounting) -> _Case:
         deviation if deviation > 1e-12 * np.abs(reward).max() else 1.0,
         1.5 * math.sqrt(2.0 * math.log(error.size)) * float(np.median(error)) if error.size else 0.0,
         outcome(name, method),
-        outcome(PRINTED, _named(PRINTED)),
-        outcome("uard", _named("uard")),
+        outcome(PRINTED, _method(PRINTED)),
+        outcome("uard", _method("uard")),
     )
-
-
-def _named(name: str) -> RewardDiscounting:
-    method = named(name)
-    assert isinstance(method, RewardDiscounting)
-    return method
 
 
 def _feedback(reward: np.ndarray, ratings: np.ndarray, item: np.ndarray | None) -> tuple[Feedback, Feedback]:
@@ -503,13 +521,14 @@ def _contradicted(case: _Case) -> Finding | None:
     worst = int(np.argmax(np.where(agreed, np.abs(gap), 0.0)))
     severity: Severity = "danger" if mine >= 0.5 else "warning" if mine >= 0.1 else "note"
     above = int((agreed & (gap > 0)).sum())
+    kept = {case.mine.name: mine, PRINTED: printed}
     return Finding(
         "reward-contradicted",
         severity,
         f"In {_rows(int(agreed.sum()))} ({above} of them paid too much) raters agree with each other and the reward is more "
         f"than a unit ({case.unit:.3g}) away; most of all in {case.place(worst)}: reward {case.reward[worst]:.3g}, ratings "
         f"{case.feedback.mean[worst]:.3g} ± {case.feedback.spread[worst]:.2g}. Of the difference "
-        f"{case.mine.name} still believes {_percent(mine)}, {PRINTED} {_percent(printed)}.",
+        f"{' and '.join(f'{name} still believes {_percent(share)}' for name, share in kept.items())}.",
         "Agreement makes sigma_h small, so a filter that looks at the raters alone trusts the reward most where they "
         "all contradict it, and the agent learns to go there.",
         f"Count the reward as one more rater (proxy_is_rater=True): named('uard') believes {_percent(advised)} of it here.",

@@ -32,15 +32,15 @@ def log(tmp_path):
 
 
 def test_the_real_program(log):
-    for text, code, last in ((HONEST, 0, "findings: none"), (LIE, 1, "findings: 1 danger")):
-        command = [UARD, "doctor", str(log(text)), "--mitigation", "uard-operator"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert (done.returncode, done.stderr) == (code, "")
-        assert done.stdout.splitlines()[-1] == last
+    command = [UARD, "doctor", str(log(LIE)), "--mitigation", "uard-operator"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert done.stdout.splitlines()[-1] == "findings: 1 danger"
 
 
 def test_exit_codes(log, capsys):
-    lie, alone = log(LIE), log("reward,rating\n" + "0,0.1\n0,-0.1\n" * 20, "one.csv")
+    honest, lie, alone = log(HONEST, "honest.csv"), log(LIE), log("reward,rating\n" + "0,0.1\n0,-0.1\n" * 20, "one.csv")
+    assert doctor(capsys, honest, "--strict", "--mitigation", "uard-operator")[0] == 0
     assert doctor(capsys, lie)[0] == 0  # uard avoids it: a note
     assert doctor(capsys, lie, "--strict")[0] == 0
     assert doctor(capsys, lie, "--mitigation", "uard-operator")[0] == 1

@@ -9,7 +9,7 @@ import pytest
 
 import uard.envs  # noqa: F401  (registers ids)
 from uard import InvalidValueError, RatingLog, doctor, logs
-from uard.diagnosis import CODES, PRINTED
+from uard.diagnosis import CODES, PRINTED, filtered
 from uard.mitigation import named
 
 N = 200
@@ -322,3 +322,21 @@ def test_extremes_make_no_nan():
         log = RatingLog(size * random.normal(size=50), size * random.normal(size=(50, 2)), sigma_m=np.full(50, size))
         for m in ("uard", PRINTED, "uard-wiener"):
             assert "nan" not in str(doctor(log, m))
+
+
+def test_filtered_rewards_are_what_the_doctor_looks_at():
+    # The printed filter pays 4 / (1 + sd of {-1, 2, 1}) at the trap; see above for what uard makes of one rater.
+    log = two_kinds((0.0, [0.0, 0.0, 0.0]), (4.0, [-1.0, 2.0, 1.0]))
+    assert filtered(log, PRINTED)[[0, -1]] == pytest.approx([0.0, 4 / (1 + np.std([-1, 2, 1]))])
+    assert filtered(two_kinds((0.0, [0.0]), (4.0, [0.0])))[[0, -1]] == pytest.approx([0.0, 4 / 34.5])
+    half = clean()
+    half.ratings[::2] = np.nan
+    assert np.isfinite(filtered(half)).all()
+
+
+@pytest.mark.parametrize(("column", "value"), [("reward", np.nan), ("ratings", np.inf), ("sigma_m", np.nan)])
+def test_no_nan_is_filtered_silently(column, value):
+    log = clean(sigma_m=np.full(N, 0.1))
+    getattr(log, column)[3] = value
+    with pytest.raises(InvalidValueError, match=rf"{column}\[3"):
+        filtered(log)
