@@ -103,6 +103,16 @@ class Ledger:
 
 
 @dataclass(frozen=True)
+class BestOfN:
+    """Choose the best of n = 1 .. 10 000 by K reward models, and see what it is worth in gold."""
+
+    seeds: int = 20
+    """Number of seeds (0, 1, ...); about a second each."""
+    json: str | None = None
+    """Write one JSON object to this file; - for standard output."""
+
+
+@dataclass(frozen=True)
 class List:
     """List environments, agents, mitigations, panels and studies."""
 
@@ -142,6 +152,7 @@ Command = (
     | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
     | Annotated[Ledger, tyro.conf.subcommand("ledger")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+    | Annotated[BestOfN, tyro.conf.subcommand("best-of-n")]
     | Annotated[List, tyro.conf.subcommand("list")]
 )
 
@@ -164,9 +175,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     except ModuleNotFoundError as error:
         sys.exit(f"{_NEEDS_LAB} ({error})")
     try:
-        {Run: _run, Reproduce: _reproduce, Ledger: _ledger, Doctor: _doctor, List: _list}[type(command)](
-            command, console
-        )
+        {Run: _run, Reproduce: _reproduce, Ledger: _ledger, Doctor: _doctor, BestOfN: _best_of_n, List: _list}[
+            type(command)
+        ](command, console)
     except (InvalidValueError, StoreError) as error:
         console.print(f"[red]error:[/red] {_escape(str(error))}", soft_wrap=True)
         sys.exit(2)
@@ -417,6 +428,26 @@ def _log(command: Doctor) -> Any:
         raise _invalid("set", dict(settings), f"keywords of {command.log} ({error})") from None
     with env:
         return logs.rollout(env, command.steps, command.seed)
+
+
+def _best_of_n(command: BestOfN, console: Console) -> None:
+    from uard import _checks
+    from uard.reporting import overoptimisation
+    from uard.studies import best_of_n
+
+    _checks.whole("seeds", command.seeds, low=2, high=100_000)
+    _check_json(command.json)
+    with console.status(f"choosing the best of n, {command.seeds} seeds"):
+        result = best_of_n.run(range(command.seeds))
+    data = {"command": f"uard best-of-n --seeds {command.seeds}", "version": __version__} | result.as_data()
+    if command.json is not None:
+        _write_json(data, command.json, indent=None)
+    if command.json != "-":
+        from rich.console import Console
+
+        overoptimisation.table(data).to_rich(Console())
+        for loss in overoptimisation.losses(data):
+            print(loss)
 
 
 def _list(command: List, console: Console) -> None:

@@ -1,17 +1,18 @@
 """Best-of-n against a gold reward: does scoring by K reward models survive choosing the best of very many?
 
 The setting of Gao et al. (2023) and Coste et al. (2024), small and synthetic, in NumPy. An answer is a vector x of
-normal features. Its gold reward grows along one direction and falls with distance from what is typical. K reward models
-(logistic regression on random ReLU features of their own: Bradley-Terry) are fitted to noisy preferences between typical
-answers, so they extrapolate, each in its own way, to the answers that best-of-n finds. Scores are standardised on the
-pool, and ``uard`` is the library's own mitigation: the K scores are the ratings, their mean is the observed reward.
+normal features. Its gold reward grows along one direction and falls with distance from what is typical. K reward
+models (logistic regression on random ReLU features of their own: Bradley-Terry) are fitted to noisy preferences between
+typical answers, so they extrapolate, each in its own way, to the answers that best-of-n finds. Scores are standardised
+on the pool, and ``uard`` is the library's own mitigation: the K scores are the ratings, their mean is the observed
+reward.
 
 Panels:
 
 * ``independent``: every model has its own preferences;
 * ``contested``: the same, but the people behind 2 of 5 models also like flattery, which is worth nothing;
-* ``colluding``: all models are fitted to the same preferences, of people who all like flattery. No method that listens to
-  them can help: a should-fail control.
+* ``colluding``: all models are fitted to the same preferences, of people who all like flattery. No method that listens
+  to them can help: a should-fail control.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import numpy as np
 
 from uard import _checks
 from uard.mitigation import Evidence, Feedback, Mitigation, named
-from uard.statistics import Summary, summarise
+from uard.statistics import summarise
 
 PANELS = ("independent", "contested", "colluding")
 LARGEST = 10_000
@@ -233,7 +234,7 @@ class Result:
         problem: The sizes.
         seeds: The seeds.
         sizes: Each n.
-        gold: (panel, method) to what the best of n is worth in gold, (seeds, sizes), in standard deviations of the pool.
+        gold: (panel, method) to what the best of n is worth in gold, (seeds, sizes), in deviations of the pool.
         proxy: The same in the score by which it was chosen.
     """
 
@@ -243,33 +244,32 @@ class Result:
     gold: dict[tuple[str, str], np.ndarray]
     proxy: dict[tuple[str, str], np.ndarray]
 
-    def worth(self, panel: str, method: str, n: int) -> Summary:
-        """Summarise over seeds what the best of n is worth in gold."""
-        return summarise(self.gold[panel, method][:, self.sizes.index(n)])
-
-    def advantage(self, panel: str, method: str, over: str, n: int) -> Summary:
-        """Summarise over seeds, in pairs, by how much one method's best of n is worth more than another's."""
-        at = self.sizes.index(n)
-        return summarise(self.gold[panel, method][:, at] - self.gold[panel, over][:, at])
-
     def as_data(self) -> dict[str, Any]:
-        """Return everything as plain data that JSON can hold."""
+        """Return summaries over seeds as plain data that JSON can hold.
+
+        Per curve: ``gold`` and ``proxy``, and ``over_uard``, by how much gold is above that of ``uard``, seed by seed.
+        """
         curves = [
             {
                 "panel": panel,
                 "method": method,
-                "gold": _summaries(self.gold[panel, method]),
+                "gold": _summaries(gold),
                 "proxy": _summaries(self.proxy[panel, method]),
+                "over_uard": _summaries(gold - self.gold[panel, "uard"]),
             }
-            for panel, method in self.gold
+            for (panel, method), gold in self.gold.items()
         ]
-        kl = [divergence(n) for n in self.sizes]
-        return {"problem": asdict(self.problem), "seeds": list(self.seeds), "n": list(self.sizes), "kl": kl, "curves": curves}
+        sizes = {"n": list(self.sizes), "kl": [round(divergence(n), 4) for n in self.sizes]}
+        return {"problem": asdict(self.problem), "seeds": list(self.seeds), **sizes, "curves": curves}
 
 
 def _summaries(values: np.ndarray) -> dict[str, list[Any]]:
     columns = [summarise(column) for column in values.T]
-    return {name: [getattr(c, name) for c in columns] for name in ("mean", "sd", "ci95")}
+    return {
+        "mean": [round(c.mean, 4) for c in columns],
+        "sd": [round(c.sd, 4) for c in columns],
+        "ci95": [[round(x, 4) for x in c.ci95] for c in columns],
+    }
 
 
 def run(seeds: Sequence[int], problem: Problem | None = None, panels: Sequence[str] = PANELS) -> Result:
