@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from uard.reporting import figures
-from uard.reporting.tables import Table, number
+from uard.reporting.tables import Table
 
 SHOWN = (10, 100, 1000, 10_000)
 COLOURS = {
@@ -37,9 +37,9 @@ def losses(data: Mapping[str, Any]) -> list[str]:
         curve = next(c for c in data["curves"] if c["panel"] == panel and c["method"] == "uard")
         gold = curve["gold"]["mean"]
         peak = int(np.argmax(gold))
-        fall = "its gold never falls"
+        fall = "the gold of uard never falls"
         if peak < len(gold) - 1:
-            fall = f"its gold falls from {gold[peak]:.2f} at n = {data['n'][peak]} to {gold[-1]:.2f} at n = {data['n'][-1]}"
+            fall = f"the gold of uard falls from {gold[peak]:.2f} at n = {data['n'][peak]} to {gold[-1]:.2f} at n = {data['n'][-1]}"
         text = f"Best-of-n, {panel} reward models, {len(data['seeds'])} seeds: {fall}; "
         out.append(
             text + ("worth more than uard: " + "; ".join(beaten) if beaten else "nothing is worth more than uard") + "."
@@ -55,15 +55,14 @@ def table(data: Mapping[str, Any]) -> Table:
         for n in SHOWN:
             i = data["n"].index(n)
             low, high = c["gold"]["ci95"][i]
-            mean, sd = c["gold"]["mean"][i], c["gold"]["sd"][i]
-            cells.append(f"{number(mean)} ± {number(sd)} [{number(low)}, {number(high)}]")
+            cells.append(f"{c['gold']['mean'][i]:.2f} [{low:.2f}, {high:.2f}]")
         rows.append((c["panel"], c["method"], *cells))
     return Table(
         "Best-of-n: what the chosen answer is worth in gold",
         ("reward models", "chosen by", *(f"n = {n}" for n in SHOWN)),
         tuple(rows),
         2,
-        f"Standard deviations of the pool; mean ± sd [95 % interval of the mean] over {len(data['seeds'])} seeds. Unbiased "
+        f"Standard deviations of the pool; mean [95 % interval of the mean] over {len(data['seeds'])} seeds. Unbiased "
         f"closed-form estimator over {data['problem']['pool']} answers; {data['problem']['models']} reward models on "
         f"{data['problem']['pairs']} noisy preferences each; {data['command']}. In `contested` the people behind 2 of 5 models "
         "like flattery, in `colluding` all models share the preferences of such people: a control that must fail.",
