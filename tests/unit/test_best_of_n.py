@@ -110,13 +110,14 @@ def test_seeds_decide_everything():
 
 def test_reward_models_have_learned_and_flattery_misleads():
     def quality(panel):
-        found = [draw(SMALL, panel, seed) for seed in range(4)]
+        found = [draw(Problem(pool=10_000), panel, seed) for seed in range(3)]
         return np.mean([[np.corrcoef(d.gold, s)[0, 1] for s in d.scores.T] for d in found], axis=0)
 
     honest, contested, wrong = (quality(panel) for panel in PANELS)
-    assert honest.min() > 0.4
-    assert contested[0] < contested[1:].mean() - 0.1  # 2 * 3 // 5 = 1 of three likes flattery
-    assert wrong.mean() < honest.mean() - 0.1
+    assert honest.min() > 0.75
+    assert contested[2:].min() > 0.75
+    assert contested[:2].max() < 0.65  # those two learned from people who like flattery
+    assert wrong.max() < 0.65
 
 
 def test_the_mitigation_is_the_library_s_own():
