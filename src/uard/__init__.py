@@ -13,6 +13,8 @@ from uard._version import __version__
 if TYPE_CHECKING:
     from uard._checks import InvalidValueError, UnknownNameError
     from uard.abstention import Abstention
+    from uard.diagnosis import Diagnosis, Finding, doctor
+    from uard.logs import RatingLog
     from uard.mitigation import Evidence, Feedback, LearningSignal, Mitigation, RewardDiscounting
     from uard.reliability import ReliabilityFilter, discount, total_uncertainty
     from uard.uncertainty import sigma_human, sigma_model
@@ -21,6 +23,10 @@ _HOME = {
     "InvalidValueError": "_checks",
     "UnknownNameError": "_checks",
     "Abstention": "abstention",
+    "Diagnosis": "diagnosis",
+    "Finding": "diagnosis",
+    "doctor": "diagnosis",
+    "RatingLog": "logs",
     "Evidence": "mitigation",
     "Feedback": "mitigation",
     "LearningSignal": "mitigation",
@@ -35,16 +41,20 @@ _HOME = {
 
 __all__ = [
     "Abstention",
+    "Diagnosis",
     "Evidence",
     "Feedback",
+    "Finding",
     "InvalidValueError",
     "LearningSignal",
     "Mitigation",
+    "RatingLog",
     "ReliabilityFilter",
     "RewardDiscounting",
     "UnknownNameError",
     "__version__",
     "discount",
+    "doctor",
     "sigma_human",
     "sigma_model",
     "total_uncertainty",

@@ -1,4 +1,4 @@
-"""The command line: ``uard run``, ``reproduce``, ``ledger``, ``list``. A command imports what it needs when it runs."""
+"""The command line, ``uard run`` and its like (``uard --help``). A command imports what it needs when it runs."""
 
 from __future__ import annotations
 
@@ -103,20 +103,62 @@ class Ledger:
 
 
 @dataclass(frozen=True)
+class BestOfN:
+    """Choose the best of n = 1 .. 10 000 by K reward models, and see what it is worth in gold."""
+
+    seeds: int = 20
+    """Number of seeds (0, 1, ...); about a second each."""
+    json: str | None = None
+    """Write one JSON object to this file; - for standard output."""
+
+
+@dataclass(frozen=True)
 class List:
     """List environments, agents, mitigations, panels and studies."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Name every known trap that a log of rewards and ratings is in, and what avoids it.
+
+    Exit code 0: no danger; 1: a danger (with --strict also a warning); 2: bad input.
+    """
+
+    log: Positional[str]
+    """A CSV, JSONL or Parquet file (columns: reward, rating..., and if you have them sigma_m, true_reward, item,
+    episode, step), or the id of a Gymnasium environment, which is rolled out with random actions."""
+    reward: str = "reward"
+    """The column of rewards."""
+    ratings: tuple[str, ...] = ()
+    """The annotators' columns; all that start with `rating` if left out."""
+    mitigation: str = "uard"
+    """The filter that is going to be used."""
+    set_mitigation: Annotated[_Pairs, arg(metavar="NAME=VALUE")] = ()
+    """Change a field of it, e.g. kappa=0. Repeatable."""
+    set: Annotated[_Pairs, arg(metavar="NAME=VALUE")] = ()
+    """A keyword of the environment, e.g. panel=main. Repeatable."""
+    steps: int = 1000
+    """Steps in the environment."""
+    seed: int = 0
+    """Seed of the environment and of the actions."""
+    strict: bool = False
+    """Let a warning count as a danger."""
+    json: str | None = None
+    """Write one JSON object to this file; - for standard output."""
 
 
 Command = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
     | Annotated[Ledger, tyro.conf.subcommand("ledger")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+    | Annotated[BestOfN, tyro.conf.subcommand("best-of-n")]
     | Annotated[List, tyro.conf.subcommand("list")]
 )
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run the command line. Exit code 2 for bad input, 1 for a failed run, 130 for an interrupt."""
+    """Run the command line. Exit code 2 for bad input, 1 for a failed run or a danger, 130 for an interrupt."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments in (["--version"], ["-V"]):
         print(f"uard {__version__}")
@@ -133,7 +175,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     except ModuleNotFoundError as error:
         sys.exit(f"{_NEEDS_LAB} ({error})")
     try:
-        {Run: _run, Reproduce: _reproduce, Ledger: _ledger, List: _list}[type(command)](command, console)
+        {Run: _run, Reproduce: _reproduce, Ledger: _ledger, Doctor: _doctor, BestOfN: _best_of_n, List: _list}[
+            type(command)
+        ](command, console)
     except (InvalidValueError, StoreError) as error:
         console.print(f"[red]error:[/red] {_escape(str(error))}", soft_wrap=True)
         sys.exit(2)
@@ -344,6 +388,66 @@ def _ledger(command: Ledger, console: Console) -> None:
         _write_json(ledger.as_data(entries, seeds), command.json)
     if command.json != "-":
         ledger.to_rich(entries)
+
+
+def _doctor(command: Doctor, console: Console) -> None:
+    from uard import doctor
+    from uard.lab import names
+
+    _check_json(command.json)
+    mitigation: Any = command.mitigation
+    if command.set_mitigation:
+        changes = names.settings(command.set_mitigation, "--set-mitigation")
+        mitigation = names.mitigation_named(command.mitigation, changes)
+    found = doctor(_log(command), mitigation)
+    if command.json is not None:
+        _write_json({"version": __version__} | found.as_data(), command.json)
+    if command.json != "-":
+        print(found)
+    if found.count("danger") or (command.strict and found.count("warning")):
+        sys.exit(1)
+
+
+def _log(command: Doctor) -> Any:
+    """Return the log: of a file if it looks like one, else of an environment."""
+    import gymnasium
+
+    import uard.envs  # noqa: F401  (registers ids)
+    from uard import logs
+    from uard.lab import names
+
+    if Path(command.log).suffix.lower() in logs.FORMATS or Path(command.log).exists():
+        return logs.read(command.log, command.reward, command.ratings or None)
+    settings = names.settings(command.set)
+    try:
+        env = gymnasium.make(command.log, **settings)
+    except gymnasium.error.Error as error:
+        allowed = f"a file that ends in {', '.join(logs.FORMATS)}, or the id of a Gymnasium environment ({error})"
+        raise _invalid("log", command.log, allowed) from None
+    except TypeError as error:  # an unknown keyword
+        raise _invalid("set", dict(settings), f"keywords of {command.log} ({error})") from None
+    with env:
+        return logs.rollout(env, command.steps, command.seed)
+
+
+def _best_of_n(command: BestOfN, console: Console) -> None:
+    from uard import _checks
+    from uard.reporting import overoptimisation
+    from uard.studies import best_of_n
+
+    _checks.whole("seeds", command.seeds, low=2, high=100_000)
+    _check_json(command.json)
+    with console.status(f"choosing the best of n, {command.seeds} seeds"):
+        result = best_of_n.run(range(command.seeds))
+    data = {"command": f"uard best-of-n --seeds {command.seeds}", "version": __version__} | result.as_data()
+    if command.json is not None:
+        _write_json(data, command.json, indent=None)
+    if command.json != "-":
+        from rich.console import Console
+
+        overoptimisation.table(data).to_rich(Console())
+        for loss in overoptimisation.losses(data):
+            print(loss)
 
 
 def _list(command: List, console: Console) -> None:

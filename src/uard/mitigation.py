@@ -306,13 +306,16 @@ class RewardDiscounting(Mitigation):
         weight = weight * uncertainty.shrink(one, feedback.count, self.unrated_weight, self.prior_count)
         return weight, sigma_h, lam
 
+    def reward_anchor(self, reward: Array, feedback: Feedback, usual: Usual) -> Array:
+        """Return b, what a reward is drawn towards."""
+        if self.anchor == "zero":
+            return 0.0 * reward
+        return uncertainty.shrink(feedback.lowest, feedback.count, usual.lowest, self.prior_count)
+
     def explain(self, evidence: Evidence, usual: Usual) -> Explanation:
         """Return weight and anchor of a reward, and what they were made from."""
         f, r = evidence.feedback, evidence.reward
-        if self.anchor == "zero":
-            anchor = 0.0 * r
-        else:
-            anchor = uncertainty.shrink(f.lowest, f.count, usual.lowest, self.prior_count)
+        anchor = self.reward_anchor(r, f, usual)
         weight, sigma_h, lam = self._weigh(r - anchor, r, evidence.sigma_m, f, usual)
         return Explanation(sigma_h, lam, weight, anchor)
 

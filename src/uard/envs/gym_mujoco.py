@@ -62,13 +62,8 @@ class LocomotionEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if isinstance(region, str):
             _checks.choose("region", region, REGIONS)
             region = REGIONS[region]()
-        self.spec_of = mujoco.Locomotion(
-            robot,
-            version,
-            region,
-            legitimate=legitimate,
-            horizon=horizon,  # type: ignore[arg-type]
-        )
+        lies: Any = region
+        self.spec_of = mujoco.Locomotion(robot, version, lies, legitimate=legitimate, horizon=horizon)
         if panel is not None:
             _checks.choose("panel", panel, panels.PANELS)
         _checks.number("noise", noise, low=0)

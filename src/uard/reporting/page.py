@@ -16,7 +16,7 @@ from uard import InvalidValueError, __version__, statistics, studies
 from uard.lab.result import CALIBRATION, WINDOW
 from uard.lab.store import Store
 from uard.lab.study import Row
-from uard.reporting import audit, deep, figures, ledger, locomotion, paper, published, theory
+from uard.reporting import audit, deep, figures, ledger, locomotion, overoptimisation, paper, published, theory
 from uard.reporting.evidence import Evidence
 from uard.reporting.tables import Table, brief, full, number, study_table
 from uard.statistics import Summary
@@ -36,6 +36,7 @@ def write(folder: Path, store: Store, seeds: Sequence[int]) -> Path:
     chosen = studies.grid()
     evidence = Evidence(store, seeds, chosen)
     entries = ledger.entries(evidence)
+    best_of_n = deep.packaged_json("best-of-n.json")
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     page = environment.get_template("page.html.j2").render(
@@ -43,12 +44,19 @@ def write(folder: Path, store: Store, seeds: Sequence[int]) -> Path:
         seeds=len(evidence.seeds),
         window=WINDOW,
         headline=_headline(evidence),
-        losses=_losses(evidence) + deep.losses(published.packaged()) + locomotion.losses(published.packaged()),
+        losses=[
+            *_losses(evidence),
+            *deep.losses(published.packaged()),
+            *locomotion.losses(published.packaged()),
+            *overoptimisation.losses(best_of_n),
+        ],
         deep_tables=[_sources(evidence), *deep.tables(published.packaged())],
         deep_figures=deep.drawn(published.packaged()),
         mujoco_tables=locomotion.tables(published.packaged()),
         mujoco_figures=locomotion.drawn(published.packaged()),
         deep_made=published.packaged().sources,
+        best_of_n=overoptimisation.table(best_of_n),
+        best_of_n_figure=figures.data_uri(overoptimisation.figure(best_of_n)),
         film=json.dumps(_film(evidence)),
         tables=_paper_tables(evidence),
         figures=_figures(evidence),

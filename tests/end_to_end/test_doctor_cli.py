@@ -1,0 +1,120 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from uard import __version__, cli
+
+UARD = str(Path(sys.executable).parent / "uard")
+HONEST = "reward,rating_ann,rating_bob\n" + "".join(f"{i / 50},{i / 50 + 0.001},{i / 50 - 0.001}\n" for i in range(50))
+LIE = "reward,rating_ann,rating_bob\n" + "0,0.1,-0.1\n" * 45 + "4,-0.1,0.1\n" * 5
+
+
+def doctor(capsys, *arguments):
+    """Run the command and return its exit code and what it printed."""
+    try:
+        cli.main(["doctor", *map(str, arguments)])
+        code = 0
+    except SystemExit as stopped:
+        code = stopped.code
+    return code, *capsys.readouterr()
+
+
+@pytest.fixture
+def log(tmp_path):
+    def write(text, name="log.csv"):
+        (tmp_path / name).write_text(text)
+        return tmp_path / name
+
+    return write
+
+
+def test_the_real_program(log):
+    command = [UARD, "doctor", str(log(LIE)), "--mitigation", "uard-operator"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert done.stdout.splitlines()[-1] == "findings: 1 danger"
+
+
+def test_exit_codes(log, capsys):
+    honest, lie, alone = log(HONEST, "honest.csv"), log(LIE), log("reward,rating\n" + "0,0.1\n0,-0.1\n" * 20, "one.csv")
+    assert doctor(capsys, honest, "--strict", "--mitigation", "uard-operator")[0] == 0
+    assert doctor(capsys, lie)[0] == 0  # uard avoids it: a note
+    assert doctor(capsys, lie, "--strict")[0] == 0
+    assert doctor(capsys, lie, "--mitigation", "uard-operator")[0] == 1
+    assert doctor(capsys, lie, "--set-mitigation", "proxy_is_rater=false")[0] == 1
+    assert doctor(capsys, alone)[0] == 0  # one rater: a warning
+    assert doctor(capsys, alone, "--strict")[0] == 1
+
+
+def test_json(log, capsys, tmp_path):
+    code, out, _ = doctor(capsys, log(LIE), "--mitigation", "uard-operator", "--json", "-")
+    answer = json.loads(out)
+    assert code == 1
+    assert answer["version"] == __version__
+    assert (answer["rows"], answer["raters"], answer["mitigation"]) == (
+        50,
+        ["rating_ann", "rating_bob"],
+        "uard-operator",
+    )
+    (found,) = answer["findings"]
+    assert found.keys() == {"code", "severity", "evidence", "consequence", "remedy", "numbers"}
+    assert (found["code"], found["numbers"]["rows"]) == ("reward-contradicted", 5)
+    code, out, _ = doctor(capsys, log(LIE), "--json", tmp_path / "deep" / "out.json")
+    assert "reward-contradicted" in out
+    assert json.loads((tmp_path / "deep" / "out.json").read_text())["findings"][0]["severity"] == "note"
+
+
+def test_json_of_a_log_with_nothing_in_it(log, capsys):
+    """What is not defined is null: NaN is no JSON."""
+    code, out, _ = doctor(capsys, log("reward,rating_1\nnan,1\n1,inf\n"), "--json", "-")
+    answer = json.loads(out, parse_constant=lambda name: pytest.fail(name))
+    assert (code, answer["agreement"], answer["calibration"]) == (1, None, None)
+    assert [f["code"] for f in answer["findings"]] == ["not-finite", "no-ratings"]
+
+
+@pytest.mark.parametrize(("panel", "code"), [("main", 0), ("colluding", 1)])
+def test_environments(capsys, panel, code):
+    got, out, _ = doctor(capsys, "uard/TrapGrid6-v0", "--set", f"panel={panel}", "--steps", 400)
+    assert got == code
+    assert ("colluding-raters" in out) == (panel == "colluding")
+    assert "uard/TrapGrid6-v0, 400 random steps, seed 0: 400 rows, 3 raters" in out
+
+
+def test_columns(log, capsys):
+    path = log(LIE.replace("reward", "score").replace("rating_ann", "ann"))
+    code, out, _ = doctor(capsys, path, "--reward", "score", "--ratings", "ann", "rating_bob")
+    assert code == 0
+    assert "2 raters (ann, rating_bob)" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("nope.csv", "log = 'nope.csv': must be a file that can be read (No such file or directory)"),
+        ("log.csv --reward rewrd", "log.csv: column = 'rewrd': must be one of rating_ann, rating_bob, reward (did you"),
+        ("log.csv --ratings ann", "log.csv: column = 'ann': must be one of rating_ann, rating_bob, reward"),
+        ("log.csv --mitigation raw", "mitigation = 'raw': must be a form of the filter"),
+        ("log.csv --mitigation urad", "mitigation = 'urad': must be one of "),
+        ("log.csv --set-mitigation kapa=1", "mitigation setting = 'kapa': must be one of "),
+        ("log.csv --set-mitigation kappa=-1", "kappa = -1.0: must be"),
+        ("log.csv --json .", "json = '.': must be a file, not a folder"),
+        ("empty.csv", "log = 'empty.csv': must be a CSV file whose first line names its columns"),
+        ("nothing", "log = 'nothing': must be a file that ends in .csv"),
+        ("uard/TrapGird6-v0", "log = 'uard/TrapGird6-v0': must be a file that ends in .csv"),
+        ("uard/TrapGrid6-v0 --set pannel=main", "set = {'pannel': 'main'}: must be keywords of uard/TrapGrid6-v0"),
+        ("uard/TrapGrid6-v0 --set panel=mian", "panel = 'mian': must be one of"),
+        ("uard/TrapGrid6-v0 --steps 0", "steps = 0: must be a whole number >= 1"),
+        ("uard/TrapGrid6-v0 --seed -1", "seed = -1: must be a whole number >= 0"),
+    ],
+)
+def test_bad_input(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("log.csv").write_text(LIE)
+    Path("empty.csv").write_text("")
+    code, out, error = doctor(capsys, *arguments.split())
+    assert (code, out) == (2, "")
+    assert error.startswith(f"error: {message}")
+    assert error.count("\n") == 1
