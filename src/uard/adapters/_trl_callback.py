@@ -1,0 +1,113 @@
+"""The callback of the TRL adapter; apart, because it alone needs transformers before anything is trained."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from typing import Any
+
+try:
+    from transformers import TrainerCallback
+except ImportError as error:
+    raise ImportError("ReliabilityCallback needs transformers: pip install 'uard[trl]'") from error
+
+from uard import _checks
+from uard.adapters.trl import UncertaintyDiscountedReward, keeps_factor
+
+log = logging.getLogger(__name__)
+
+ENOUGH_GROUPS = 16  # discounted groups before a verdict about normalisation
+AGREED = 1e-6  # largest sigma_h, in standard deviations of a judge, at which judges count as one
+
+
+class DiscountCancelledWarning(UserWarning):
+    """Group normalisation takes the discount out of the advantages again."""
+
+
+class UselessJudgeWarning(UserWarning):
+    """A judge cannot be compared with the others, or says what they say."""
+
+
+class ReliabilityCallback(TrainerCallback):
+    """Watches an ``UncertaintyDiscountedReward`` during training: warns (each warning once), and reports at the end.
+
+    It warns of group normalisation that cancels the discount (more than half of the groups that are discounted have
+    nearly the same advantages without it), of a judge that never varies or never scores, of judges that never
+    disagree, and of a reward that the trainer does not call.
+
+    Attributes:
+        reward: What is watched.
+        patience: Completions before a judge is called useless.
+    """
+
+    def __init__(self, reward: UncertaintyDiscountedReward, patience: int = 256):
+        """Watch a reward.
+
+        Args:
+            reward: The one that the trainer has among its ``reward_funcs``.
+            patience: See the attribute; >= 1.
+
+        Raises:
+            InvalidValueError: for another kind of reward.
+        """
+        if not isinstance(reward, UncertaintyDiscountedReward):
+            raise _checks.InvalidValueError("reward", reward, "an UncertaintyDiscountedReward")
+        _checks.whole("patience", patience, low=1)
+        self.reward, self.patience = reward, patience
+        self._warned: set[str] = set()
+
+    def on_step_end(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
+        """Look for what deserves a warning."""
+        tally = self.reward.tally
+        if tally.completions == 0:
+            self._warn(
+                "the reward that ReliabilityCallback watches has not been called: is it this very object that the "
+                "trainer has in reward_funcs, and in this process?",
+                UselessJudgeWarning,
+            )
+        if not keeps_factor(args) and tally.discounted >= ENOUGH_GROUPS and 2 * tally.cancelled > tally.discounted:
+            self._warn(
+                "group normalisation cancels the discount: most groups of completions that are doubted (mean weight "
+                "below 0.9) have the same advantages without it, because all completions of a group are doubted "
+                "alike. Use scale_rewards='batch' or 'none' (with multi_objective_aggregation='sum_then_normalize'), "
+                "or judges that tell the completions of one prompt apart",
+                DiscountCancelledWarning,
+            )
+        if tally.completions >= self.patience:
+            self._warn_of_judges()
+
+    def on_train_end(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
+        """Report to the log."""
+        log.info("%s", self.report())
+
+    def report(self) -> str:
+        """Return what has been seen so far, for people."""
+        tally = self.reward.tally
+        scored = tally.completions - tally.unscored
+        lines = [
+            f"{tally.completions} completions, {tally.unscored} without any score, {tally.unchecked} that could not be "
+            f"checked; mean weight {tally.weight / max(scored, 1):.2f}",
+            f"{tally.discounted} groups discounted, {tally.cancelled} of them cancelled by group normalisation",
+        ]
+        for name, deviation in self.reward.deviations.items():
+            lines.append(f"judge {name}: deviation {deviation:.3g}, {tally.missing[name]} scores missing")
+        return "\n".join(lines)
+
+    def _warn_of_judges(self) -> None:
+        tally = self.reward.tally
+        for name, deviation in self.reward.deviations.items():
+            if tally.missing[name] == tally.completions:
+                self._warn(f"judge {name!r} has not scored any completion", UselessJudgeWarning)
+            elif deviation == 0:
+                self._warn(f"judge {name!r} gives every completion the same score", UselessJudgeWarning)
+        if tally.widest < AGREED:
+            self._warn(
+                "the judges have never disagreed: sigma_h is 0 and the reward is trusted blindly. Are they copies of "
+                "one another?",
+                UselessJudgeWarning,
+            )
+
+    def _warn(self, message: str, category: type[UserWarning]) -> None:
+        if message not in self._warned:
+            self._warned.add(message)
+            warnings.warn(message, category, stacklevel=2)
