@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import logging
+import pickle
 import warnings
+from pathlib import Path
 from typing import Any
 
 try:
     from transformers import TrainerCallback
+    from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR
 except ImportError as error:
     raise ImportError("ReliabilityCallback needs transformers: pip install 'uard[trl]'") from error
 
@@ -28,12 +31,17 @@ class UselessJudgeWarning(UserWarning):
     """A judge cannot be compared with the others, or says what they say."""
 
 
+class ForgottenWarning(UserWarning):
+    """Training goes on from a checkpoint that does not hold what the reward knew."""
+
+
 class ReliabilityCallback(TrainerCallback):
     """Watches an ``UncertaintyDiscountedReward`` during training: warns (each warning once), and reports at the end.
 
     It warns of group normalisation that cancels the discount (more than half of the groups that are discounted have
     nearly the same advantages without it), of a judge that never varies or never scores, of judges that never
-    disagree, and of a reward that the trainer does not call.
+    disagree, and of a reward that the trainer does not call. What the reward knows is kept in every checkpoint and read
+    again when training is resumed.
 
     Attributes:
         reward: What is watched.
@@ -55,6 +63,27 @@ class ReliabilityCallback(TrainerCallback):
         _checks.whole("patience", patience, low=1)
         self.reward, self.patience = reward, patience
         self._warned: set[str] = set()
+
+    def on_train_begin(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
+        """Give the reward back what it knew, if training is resumed."""
+        if state.global_step == 0:
+            return
+        file = _file(args, state)
+        if file.exists():
+            self.reward.memory = pickle.loads(file.read_bytes())
+        else:
+            warnings.warn(
+                f"training is resumed at step {state.global_step}, but {file} does not exist: the judges' scales and "
+                "what disagreement is usual are learned anew",
+                ForgottenWarning,
+                stacklevel=2,
+            )
+
+    def on_save(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
+        """Keep what the reward knows beside the checkpoint's other files."""
+        file = _file(args, state)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(pickle.dumps(self.reward.memory))
 
     def on_step_end(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
         """Look for what deserves a warning."""
@@ -111,3 +140,8 @@ class ReliabilityCallback(TrainerCallback):
         if message not in self._warned:
             self._warned.add(message)
             warnings.warn(message, category, stacklevel=2)
+
+
+def _file(args: Any, state: Any) -> Path:
+    folder = f"{PREFIX_CHECKPOINT_DIR}-{state.global_step}"
+    return Path(args.output_dir) / folder / f"uard_reward_{args.process_index}.pkl"

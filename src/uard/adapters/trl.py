@@ -7,41 +7,41 @@ TRL adds the reward functions of a list up, so their disagreement is lost. Here 
 
 **What group normalisation leaves of the discount.** A completion earns b + w (r - b): r is what the judges say
 together, b the lowest of them, w how far r is believed. GRPO subtracts the mean of a prompt's group and, with
-``scale_rewards="group"``, divides by the group's standard deviation. What *differs* within a group survives: a contested
-completion falls behind its siblings. What the whole group shares does not: if w and b are the same for all its
-completions, their advantages are those of r, however small w is. So doubt about a prompt as a whole (a ``sigma_m`` that
-is the same for all its completions) is lost under "group"; under "batch" and "none" its factor w survives. Whether this
-happens is measured group by group (``advantage_change``), and ``ReliabilityCallback`` warns when it does.
+``scale_rewards="group"``, divides by the group's standard deviation. What *differs* within a group survives: a
+contested completion falls behind its siblings. What the whole group shares does not: if w and b are the same for all
+its completions, their advantages are those of r, however small w is. So doubt about a prompt as a whole (a ``sigma_m``
+that is the same for all its completions) is lost under "group"; under "batch" and "none" its factor w survives. Whether
+this happens is measured group by group (``advantage_change``), and ``ReliabilityCallback`` warns when it does.
 
 Nothing here imports TRL, transformers or torch before a model or the callback is used.
 """
 
 from __future__ import annotations
 
-import asyncio
-import functools
-import inspect
 import math
-import os
-import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from uard import _checks
+from uard.adapters._judges import Judge, JudgeError, Scale, as_scores, ask, by_name
 from uard.mitigation import Mitigation, uard
 from uard.stream import RewardStream
 
 if TYPE_CHECKING:
-    from uard.adapters._trl_callback import DiscountCancelledWarning, ReliabilityCallback, UselessJudgeWarning
+    from uard.adapters._trl_callback import (
+        DiscountCancelledWarning,
+        ForgottenWarning,
+        ReliabilityCallback,
+        UselessJudgeWarning,
+    )
 
 __all__ = [
     "DiscountCancelledWarning",
+    "ForgottenWarning",
     "JudgeError",
     "Judged",
     "ReliabilityCallback",
@@ -54,15 +54,9 @@ __all__ = [
     "keeps_factor",
 ]
 
-Judge = Callable[..., Any]
-
 DISCOUNTED = 0.9  # a group whose mean weight is below this is discounted
 CANCELLED = 0.05  # and its discount cancelled, if the normalised advantages change by less than this
-FLAT = 1e-9  # deviations at which numbers count as equal
-
-
-class JudgeError(RuntimeError):
-    """A judge raised; the message names it, and what it raised is the cause."""
+EQUAL = 1e-9  # length of a group's centred rewards at which they count as equal
 
 
 class UnscoredWarning(UserWarning):
@@ -119,45 +113,6 @@ class Tally:
     cancelled: int = 0
 
 
-@dataclass
-class Scale:
-    """Mean and standard deviation of all numbers so far, or fixed ones.
-
-    Attributes:
-        count: Numbers so far.
-        location: Their mean.
-        square: Sum of their squared distances from it.
-        fixed: The deviation that the user gave; None for the running one.
-    """
-
-    count: int = 0
-    location: float = 0.0
-    square: float = 0.0
-    fixed: float | None = None
-
-    @property
-    def deviation(self) -> float:
-        """Population standard deviation; 0 while all numbers are equal, up to rounding."""
-        if self.fixed is not None:
-            return self.fixed
-        deviation = math.sqrt(self.square / self.count) if self.count else 0.0
-        return deviation if deviation > FLAT * abs(self.location) else 0.0
-
-    def hear(self, values: np.ndarray) -> None:
-        """Take in some numbers [Chan et al. 1979], unless the scale is fixed."""
-        if self.fixed is not None or values.size == 0:
-            return
-        mean, total = float(values.mean()), self.count + values.size
-        gap = mean - self.location
-        self.square += float(((values - mean) ** 2).sum()) + gap * gap * self.count * values.size / total
-        self.location += gap * values.size / total
-        self.count = total
-
-    def ratings(self, values: np.ndarray) -> np.ndarray:
-        """(x - location) / deviation; NaN while the deviation is 0, when a number tells nothing."""
-        return (values - self.location) / (self.deviation or math.nan)
-
-
 class UncertaintyDiscountedReward:
     """Several judges as one reward function for TRL's GRPOTrainer and RLOOTrainer.
 
@@ -199,7 +154,7 @@ class UncertaintyDiscountedReward:
                 one number or None per completion; ``async def`` too), ``RewardModel`` among them. Their names are the
                 keys of a mapping, else their ``__name__``.
             weights: One number > 0 per judge, for the mean; equal if left out.
-            proxy: Name of the judge that is the proxy instead of the mean. Where its score is missing the mean steps in.
+            proxy: Name of the judge that is the proxy instead of the mean. Where it has no score the mean steps in.
             scales: One (location, deviation > 0) per judge in its own unit, or None for the running one; all are
                 running if left out.
             sigma_m: Like a judge, but it gives the disagreement of an ensemble: one number >= 0 per completion in
@@ -213,7 +168,7 @@ class UncertaintyDiscountedReward:
             InvalidValueError: for fewer than two judges (one never disagrees with itself and would be trusted
                 blindly), judges that cannot be called or told apart, and bad numbers.
         """
-        self.judges = _by_name(judges)
+        self.judges = by_name(judges)
         if sigma_m is not None and not callable(sigma_m):
             raise _checks.InvalidValueError("sigma_m", sigma_m, "a function with the signature of a judge")
         if proxy is not None:
@@ -233,6 +188,15 @@ class UncertaintyDiscountedReward:
     def deviations(self) -> dict[str, float]:
         """Standard deviation of each judge's scores; 0 for one that has never varied."""
         return {name: scale.deviation for name, scale in zip(self.judges, self._scales, strict=True)}
+
+    @property
+    def memory(self) -> Any:
+        """All that it has learned from completions, to be pickled and set again; the judges are not in it."""
+        return self.tally, self._scales, self._members, self._stream
+
+    @memory.setter
+    def memory(self, memory: Any) -> None:
+        self.tally, self._scales, self._members, self._stream = memory
 
     def __call__(
         self,
@@ -254,8 +218,8 @@ class UncertaintyDiscountedReward:
         """
         asked = self.judges if self._sigma_m is None else {**self.judges, "sigma_m": self._sigma_m}
         question = {"prompts": prompts, "completions": completions, "completion_ids": completion_ids}
-        answers = _ask(asked, {**question, "log_extra": log_extra, "log_metric": log_metric, **columns})
-        scores = np.stack([_scores(name, answers[name], len(completions)) for name in self.judges], axis=1)
+        answers = ask(asked, {**question, "log_extra": log_extra, "log_metric": log_metric, **columns})
+        scores = np.stack([as_scores(name, answers[name], len(completions)) for name in self.judges], axis=1)
         sigma_m = self._ensemble(answers.get("sigma_m"), len(completions))
         self.last = self._discount(scores, sigma_m)
         groups = groups_of(prompts)
@@ -314,23 +278,19 @@ class UncertaintyDiscountedReward:
         unscored = missing.all(1)
         if unscored.any() and not tally.unscored:
             warnings.warn(
-                f"no judge scored completion {int(np.argmax(unscored))} ({unscored.sum()} of {len(unscored)} in this "
+                f"no judge scored completion {int(np.argmax(unscored))} ({unscored.sum()} of {unscored.size} in this "
                 "batch): they get no reward and teach nothing. Counted in tally.unscored from now on",
                 UnscoredWarning,
                 stacklevel=3,
             )
         for name, number in zip(self.judges, missing.sum(0).tolist(), strict=True):
             tally.missing[name] += number
-        tally.completions += len(unscored)
+        tally.completions += unscored.size
         tally.unscored += int(unscored.sum())
         tally.unchecked += int(((~np.isnan(judged.ratings)).sum(1) < 2)[~unscored].sum())
         tally.weight += float(np.nansum(judged.weight))
         tally.widest = float(np.nanmax(judged.sigma_h, initial=tally.widest))
-        scored = groups[~unscored]
-        weight = np.bincount(scored, judged.weight[~unscored], len(change)) / np.maximum(
-            np.bincount(scored, minlength=len(change)), 1
-        )
-        discounted = ~np.isnan(change) & (weight < DISCOUNTED)
+        discounted = ~np.isnan(change) & (_group_means(judged.weight, groups) < DISCOUNTED)
         cancelled = discounted & (change < CANCELLED)
         tally.discounted += int(discounted.sum())
         tally.cancelled += int(cancelled.sum())
@@ -407,7 +367,7 @@ class RewardModel:
 
 
 def groups_of(prompts: Sequence[Any]) -> np.ndarray:
-    """Number the groups of a batch, (B,): neighbours with the same prompt, as TRL's samplers lay them out."""
+    """Number the groups of a batch from 0, (B,): neighbours with the same prompt, as TRL's samplers lay them out."""
     texts = [repr(prompt) for prompt in prompts]
     return np.cumsum([i > 0 and text != texts[i - 1] for i, text in enumerate(texts)])
 
@@ -415,8 +375,8 @@ def groups_of(prompts: Sequence[Any]) -> np.ndarray:
 def advantage_change(raw: np.ndarray, reward: np.ndarray, groups: np.ndarray) -> np.ndarray:
     """How much the discount changes the advantages of each group that is normalised to mean 0 and deviation 1.
 
-    The distance between the two advantage vectors, relative to their length: 0 where group normalisation cancels the
-    discount; sqrt(2 - 2 rho) if the two correlate by rho; 1 if only one of them is flat.
+    The distance between the two vectors of advantages, relative to their length: sqrt(2 - 2 rho) if they correlate by
+    rho, so 0 where group normalisation cancels the discount; 1 if only one of them is flat.
 
     Args:
         raw: Rewards without the discount (B,), NaN where there is none.
@@ -424,15 +384,11 @@ def advantage_change(raw: np.ndarray, reward: np.ndarray, groups: np.ndarray) ->
         groups: The number of each completion's group (B,), from 0.
 
     Returns:
-        One number in [0, 2] per group; NaN where all rewards of the group are equal in both.
+        One number in [0, 2] per group; NaN where all rewards of the group are equal, with and without.
     """
-    change = np.full(int(groups.max(initial=-1)) + 1, np.nan)
-    for group in range(len(change)):
-        inside = (groups == group) & ~np.isnan(raw)
-        before, after = _direction(raw[inside]), _direction(reward[inside])
-        if before.any() or after.any():
-            change[group] = np.linalg.norm(after - before)
-    return change
+    before, after = _directions(raw, groups), _directions(reward, groups)
+    flat = np.bincount(groups, np.abs(before) + np.abs(after)) == 0
+    return np.where(flat, np.nan, np.sqrt(np.bincount(groups, (after - before) ** 2)))
 
 
 def keeps_factor(config: Any) -> bool:
@@ -446,38 +402,22 @@ def keeps_factor(config: Any) -> bool:
     return not divides and getattr(config, "multi_objective_aggregation", "") != "normalize_then_sum"
 
 
-def _direction(values: np.ndarray) -> np.ndarray:
-    centred = values - values.mean() if len(values) else values
-    length = np.linalg.norm(centred)
-    return centred / length if length > FLAT * math.sqrt(len(values) or 1) else np.zeros_like(centred)
+def _directions(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Centre each group's values and scale them to length 1; 0 where they are equal or missing."""
+    centred = np.nan_to_num(values - _group_means(values, groups)[groups])
+    length = np.sqrt(np.bincount(groups, centred**2))[groups]
+    return np.where(length > EQUAL, centred, 0.0) / np.where(length > EQUAL, length, 1.0)
+
+
+def _group_means(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Mean of each group's values, without the missing ones; NaN where all are missing."""
+    total, known = np.bincount(groups, np.nan_to_num(values)), np.bincount(groups, ~np.isnan(values))
+    return total / np.where(known > 0, known, np.nan)
 
 
 def _mean(values: np.ndarray) -> float:
     known = values[~np.isnan(values)]
     return float(known.mean()) if known.size else math.nan
-
-
-def _by_name(judges: Mapping[str, Judge] | Sequence[Judge]) -> dict[str, Judge]:
-    pairs = list(judges.items()) if isinstance(judges, Mapping) else [(_name(judge), judge) for judge in judges]
-    names = [name for name, _ in pairs]
-    if len(pairs) < 2:
-        allowed = "at least two: one never disagrees with itself and would be trusted blindly (members of an ensemble "
-        raise _checks.InvalidValueError("judges", names, allowed + "are judges too)")
-    for name, judge in pairs:
-        if hasattr(judge, "logits") or hasattr(judge, "get_input_embeddings"):
-            raise _checks.InvalidValueError(f"judge {name!r}", type(judge), "a function: RewardModel(model, tokenizer)")
-        if not callable(judge):
-            raise _checks.InvalidValueError(f"judge {name!r}", judge, "a reward function or a RewardModel")
-    if len(set(names)) < len(names) or "sigma_m" in names:
-        allowed = "different names, none of them 'sigma_m': give the judges as a dictionary"
-        raise _checks.InvalidValueError("names of the judges", names, allowed)
-    return dict(pairs)
-
-
-def _name(judge: Any) -> str:
-    while isinstance(judge, functools.partial):
-        judge = judge.func
-    return getattr(judge, "__name__", type(judge).__name__)
 
 
 def _weights(weights: Sequence[float] | None, number: int) -> np.ndarray:
@@ -505,62 +445,11 @@ def _scales(scales: Sequence[tuple[float, float] | None] | None, number: int) ->
     return made
 
 
-def _ask(judges: Mapping[str, Judge], question: dict[str, Any]) -> dict[str, Any]:
-    """Ask every judge; those that answer with a coroutine run at the same time as the others."""
-    size, answers = len(question["completions"]), {}
-    for name, judge in judges.items():
-        with _blaming(name, size):
-            answer = judge(**question)
-        if inspect.iscoroutine(answer):
-            answer = asyncio.run_coroutine_threadsafe(answer, _event_loop(os.getpid()))
-        answers[name] = answer
-    for name, answer in answers.items():
-        if isinstance(answer, Future):
-            with _blaming(name, size):
-                answers[name] = answer.result()
-    return answers
-
-
-@contextmanager
-def _blaming(name: str, size: int) -> Iterator[None]:
-    try:
-        yield
-    except Exception as error:
-        raise JudgeError(f"judge {name!r} raised on {size} completions: {type(error).__name__}: {error}") from error
-
-
-@functools.cache
-def _event_loop(process: int) -> asyncio.AbstractEventLoop:
-    """Return this process's one loop for judges, so that a client which a judge keeps stays usable."""
-    loop = asyncio.new_event_loop()
-    threading.Thread(target=loop.run_forever, name="uard-judges", daemon=True).start()
-    return loop
-
-
-def _scores(name: str, answer: Any, size: int) -> np.ndarray:
-    """Return a judge's answer as (size,) numbers, NaN where it gave None or NaN."""
-    try:
-        answer = answer.tolist() if hasattr(answer, "tolist") else list(answer)
-    except TypeError:
-        allowed = f"a list of {size} numbers (or None), one per completion"
-        raise _checks.InvalidValueError(f"what judge {name!r} gave", answer, allowed) from None
-    if not isinstance(answer, list) or len(answer) != size:
-        got = len(answer) if isinstance(answer, list) else answer
-        raise _checks.InvalidValueError(f"number of scores of judge {name!r}", got, f"{size}, one per completion")
-    scores = np.full(size, math.nan)
-    for index, score in enumerate(answer):
-        if score is None:
-            continue
-        plain = score.item() if getattr(score, "shape", None) == () else score
-        if not isinstance(plain, int | float) or math.isinf(plain):
-            allowed = "a finite number, or None or NaN where the judge has no score"
-            raise _checks.InvalidValueError(f"score {index} of judge {name!r}", score, allowed)
-        scores[index] = plain
-    return scores
+_WITH_TRANSFORMERS = ("DiscountCancelledWarning", "ForgottenWarning", "ReliabilityCallback", "UselessJudgeWarning")
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("DiscountCancelledWarning", "ReliabilityCallback", "UselessJudgeWarning"):
+    if name in _WITH_TRANSFORMERS:
         from uard.adapters import _trl_callback
 
         return getattr(_trl_callback, name)
