@@ -24,7 +24,7 @@ AGREED = 1e-6  # largest sigma_h, in standard deviations of a judge, at which ju
 
 
 class DiscountCancelledWarning(UserWarning):
-    """Group normalisation takes the discount out of the advantages again."""
+    """Normalisation takes the discount out of the advantages again."""
 
 
 class UselessJudgeWarning(UserWarning):
@@ -38,10 +38,10 @@ class ForgottenWarning(UserWarning):
 class ReliabilityCallback(TrainerCallback):
     """Watches an ``UncertaintyDiscountedReward`` during training: warns (each warning once), and reports at the end.
 
-    It warns of group normalisation that cancels the discount (more than half of the groups that are discounted have
-    nearly the same advantages without it), of a judge that never varies or never scores, of judges that never
-    disagree, and of a reward that the trainer does not call. What the reward knows is kept in every checkpoint and read
-    again when training is resumed.
+    It warns of normalisation that cancels the discount (more than half of the groups that are discounted have nearly
+    the same advantages without it, under this trainer's configuration), of a judge that never varies or never scores,
+    of judges that never disagree, and of a reward that the trainer does not call. What the reward knows is kept in
+    every checkpoint and read again when training is resumed.
 
     Attributes:
         reward: What is watched.
@@ -94,12 +94,18 @@ class ReliabilityCallback(TrainerCallback):
                 "trainer has in reward_funcs, and in this process?",
                 UselessJudgeWarning,
             )
-        if not keeps_factor(args) and tally.discounted >= ENOUGH_GROUPS and 2 * tally.cancelled > tally.discounted:
+        if tally.discounted >= ENOUGH_GROUPS and 2 * tally.shifted > tally.discounted:
             self._warn(
-                "group normalisation cancels the discount: most groups of completions that are doubted (mean weight "
-                "below 0.9) have the same advantages without it, because all completions of a group are doubted "
-                "alike. Use scale_rewards='batch' or 'none' (with multi_objective_aggregation='sum_then_normalize'), "
-                "or judges that tell the completions of one prompt apart",
+                "the discount has no effect: in most groups that are doubted (mean weight below 0.9) it lowers the "
+                "rewards of all completions alike, and the mean of a group is subtracted from them. The judges "
+                "disagree about prompts, not about completions",
+                DiscountCancelledWarning,
+            )
+        elif not keeps_factor(args) and tally.discounted >= ENOUGH_GROUPS and 2 * tally.cancelled > tally.discounted:
+            self._warn(
+                "group normalisation cancels the discount: most groups that are doubted (mean weight below 0.9) have "
+                "the same advantages without it, because the rewards of all completions shrink alike. Use "
+                "scale_rewards='batch' or 'none' with multi_objective_aggregation='sum_then_normalize'",
                 DiscountCancelledWarning,
             )
         if tally.completions >= self.patience:
@@ -116,7 +122,8 @@ class ReliabilityCallback(TrainerCallback):
         lines = [
             f"{tally.completions} completions, {tally.unscored} without any score, {tally.unchecked} that could not be "
             f"checked; mean weight {tally.weight / max(scored, 1):.2f}",
-            f"{tally.discounted} groups discounted, {tally.cancelled} of them cancelled by group normalisation",
+            f"{tally.discounted} groups discounted; of these {tally.cancelled} have the same advantages without the "
+            f"discount if they are divided by the group's deviation, {tally.shifted} also if not",
         ]
         for name, deviation in self.reward.deviations.items():
             lines.append(f"judge {name}: deviation {deviation:.3g}, {tally.missing[name]} scores missing")

@@ -5,13 +5,18 @@ TRL adds the reward functions of a list up, so their disagreement is lost. Here 
     reward = UncertaintyDiscountedReward([relevance, clarity, RewardModel(model, tokenizer)])
     trainer = GRPOTrainer(..., reward_funcs=reward, callbacks=[ReliabilityCallback(reward)])
 
-**What group normalisation leaves of the discount.** A completion earns b + w (r - b): r is what the judges say
-together, b the lowest of them, w how far r is believed. GRPO subtracts the mean of a prompt's group and, with
-``scale_rewards="group"``, divides by the group's standard deviation. What *differs* within a group survives: a
-contested completion falls behind its siblings. What the whole group shares does not: if w and b are the same for all
-its completions, their advantages are those of r, however small w is. So doubt about a prompt as a whole (a ``sigma_m``
-that is the same for all its completions) is lost under "group"; under "batch" and "none" its factor w survives. Whether
-this happens is measured group by group (``advantage_change``), and ``ReliabilityCallback`` warns when it does.
+**What normalisation leaves of the discount.** A completion earns b + w (r - b): r is what the judges say together, b
+the lowest of them, w how far r is believed. Trainers compare the completions of one prompt, so what *differs* among
+them survives: a contested completion falls behind its siblings. What they share does not:
+
+* a *shift*, the same w and r - b for all completions of a prompt, is always lost with the mean of the group: judges
+  who disagree about the prompt only, by the same amount for each completion, change nothing;
+* a *factor*, where all rewards of a group shrink alike (w is the same, and b too: ``anchor="zero"``), is lost with the
+  group's standard deviation, by which GRPO divides with ``scale_rewards="group"``, its default, and with
+  ``multi_objective_aggregation="normalize_then_sum"``. Under "batch" and "none", and in RLOO, it survives.
+
+How much of the discount is left is measured in every group (``advantage_change``), and ``ReliabilityCallback`` warns
+where it is nothing.
 
 Nothing here imports TRL, transformers or torch before a model or the callback is used.
 """
@@ -100,7 +105,8 @@ class Tally:
         weight: Sum of the weights of the scored ones.
         widest: Largest sigma_h.
         discounted: Groups with a mean weight below 0.9.
-        cancelled: Of these, how many have nearly the same normalised advantages without the discount.
+        shifted: Of these, how many have nearly the same advantages without the discount.
+        cancelled: How many have if a group's advantages are divided by their standard deviation; those shifted too.
     """
 
     missing: dict[str, int]
@@ -110,6 +116,7 @@ class Tally:
     weight: float = 0.0
     widest: float = 0.0
     discounted: int = 0
+    shifted: int = 0
     cancelled: int = 0
 
 
@@ -222,13 +229,14 @@ class UncertaintyDiscountedReward:
         scores = np.stack([as_scores(name, answers[name], len(completions)) for name in self.judges], axis=1)
         sigma_m = self._ensemble(answers.get("sigma_m"), len(completions))
         self.last = self._discount(scores, sigma_m)
+        self._count(self.last)
         groups = groups_of(prompts)
         change = advantage_change(self.last.raw, self.last.reward, groups)
-        cancelled = self._count(self.last, groups, change)
+        self._count_groups(self.last, groups, change)
         if log_extra is not None:
             self._log_completions(self.last, log_extra)
         if log_metric is not None:
-            self._log_means(self.last, change, cancelled, log_metric)
+            self._log_means(self.last, change, log_metric)
         return [None if math.isnan(reward) else reward for reward in self.last.reward.tolist()]
 
     def _ensemble(self, answer: Any, size: int) -> np.ndarray:
@@ -272,8 +280,7 @@ class UncertaintyDiscountedReward:
         mean = np.where(here, ratings, 0.0) @ self._weights / np.where(total > 0, total, 1.0)
         return mean if self._proxy is None else np.where(here[:, self._proxy], ratings[:, self._proxy], mean)
 
-    def _count(self, judged: Judged, groups: np.ndarray, change: np.ndarray) -> float:
-        """Add a batch to the tally; return the share of its discounted groups whose discount is cancelled, or NaN."""
+    def _count(self, judged: Judged) -> None:
         tally, missing = self.tally, np.isnan(judged.scores)
         unscored = missing.all(1)
         if unscored.any() and not tally.unscored:
@@ -290,11 +297,13 @@ class UncertaintyDiscountedReward:
         tally.unchecked += int(((~np.isnan(judged.ratings)).sum(1) < 2)[~unscored].sum())
         tally.weight += float(np.nansum(judged.weight))
         tally.widest = float(np.nanmax(judged.sigma_h, initial=tally.widest))
+
+    def _count_groups(self, judged: Judged, groups: np.ndarray, change: np.ndarray) -> None:
         discounted = ~np.isnan(change) & (_group_means(judged.weight, groups) < DISCOUNTED)
-        cancelled = discounted & (change < CANCELLED)
-        tally.discounted += int(discounted.sum())
-        tally.cancelled += int(cancelled.sum())
-        return cancelled.sum() / discounted.sum() if discounted.any() else math.nan
+        undivided = advantage_change(judged.raw, judged.reward, groups, divided=False)
+        self.tally.discounted += int(discounted.sum())
+        self.tally.shifted += int((discounted & (undivided < CANCELLED)).sum())
+        self.tally.cancelled += int((discounted & (change < CANCELLED)).sum())
 
     def _log_completions(self, judged: Judged, log_extra: Callable[[str, list], None]) -> None:
         columns = {name: judged.scores[:, k] for k, name in enumerate(self.judges)}
@@ -302,14 +311,12 @@ class UncertaintyDiscountedReward:
         for name, values in columns.items():
             log_extra(f"{self.__name__}/{name}", [None if math.isnan(x) else x for x in values.tolist()])
 
-    def _log_means(
-        self, judged: Judged, change: np.ndarray, cancelled: float, log_metric: Callable[[str, float], None]
-    ) -> None:
+    def _log_means(self, judged: Judged, change: np.ndarray, log_metric: Callable[[str, float], None]) -> None:
         missing = np.isnan(judged.scores)
         values = {f"{name}/missing": missing[:, k].mean() for k, name in enumerate(self.judges)}
         values |= {f"{name}/mean": _mean(judged.scores[:, k]) for k, name in enumerate(self.judges)}
         values |= {name: _mean(getattr(judged, name)) for name in ("raw", "weight", "sigma_h", "sigma_m", "lam")}
-        values |= {"unscored": missing.all(1).mean(), "advantage_change": _mean(change), "cancelled": cancelled}
+        values |= {"unscored": missing.all(1).mean(), "advantage_change": _mean(change)}
         for name, value in values.items():
             if not math.isnan(value):
                 log_metric(f"{self.__name__}/{name}", float(value))
@@ -372,23 +379,28 @@ def groups_of(prompts: Sequence[Any]) -> np.ndarray:
     return np.cumsum([i > 0 and text != texts[i - 1] for i, text in enumerate(texts)])
 
 
-def advantage_change(raw: np.ndarray, reward: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """How much the discount changes the advantages of each group that is normalised to mean 0 and deviation 1.
+def advantage_change(raw: np.ndarray, reward: np.ndarray, groups: np.ndarray, *, divided: bool = True) -> np.ndarray:
+    """How much the discount changes the advantages of each group, relative to the longer of the two vectors.
 
-    The distance between the two vectors of advantages, relative to their length: sqrt(2 - 2 rho) if they correlate by
-    rho, so 0 where group normalisation cancels the discount; 1 if only one of them is flat.
+    0 where normalisation cancels the discount; if the advantages with and without it correlate by rho, it is
+    sqrt(2 - 2 rho) of divided ones; 1 if only one of them is flat.
 
     Args:
         raw: Rewards without the discount (B,), NaN where there is none.
         reward: Rewards with it (B,), NaN in the same places.
         groups: The number of each completion's group (B,), from 0.
+        divided: Whether a group's advantages are divided by their standard deviation, or only centred.
 
     Returns:
         One number in [0, 2] per group; NaN where all rewards of the group are equal, with and without.
     """
-    before, after = _directions(raw, groups), _directions(reward, groups)
-    flat = np.bincount(groups, np.abs(before) + np.abs(after)) == 0
-    return np.where(flat, np.nan, np.sqrt(np.bincount(groups, (after - before) ** 2)))
+    before, after = _centred(raw, groups), _centred(reward, groups)
+    lengths = np.sqrt([np.bincount(groups, before**2), np.bincount(groups, after**2)])
+    if divided:
+        before, after = (x / np.where(n > 0, n, 1.0)[groups] for x, n in zip((before, after), lengths, strict=True))
+        lengths = np.sign(lengths)
+    longer = lengths.max(0)
+    return np.sqrt(np.bincount(groups, (after - before) ** 2)) / np.where(longer > 0, longer, np.nan)
 
 
 def keeps_factor(config: Any) -> bool:
@@ -402,11 +414,10 @@ def keeps_factor(config: Any) -> bool:
     return not divides and getattr(config, "multi_objective_aggregation", "") != "normalize_then_sum"
 
 
-def _directions(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Centre each group's values and scale them to length 1; 0 where they are equal or missing."""
+def _centred(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """Subtract each group's mean; 0 where a value is missing or the group's are equal up to rounding."""
     centred = np.nan_to_num(values - _group_means(values, groups)[groups])
-    length = np.sqrt(np.bincount(groups, centred**2))[groups]
-    return np.where(length > EQUAL, centred, 0.0) / np.where(length > EQUAL, length, 1.0)
+    return np.where(np.bincount(groups, centred**2)[groups] > EQUAL**2, centred, 0.0)
 
 
 def _group_means(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
