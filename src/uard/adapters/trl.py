@@ -227,7 +227,7 @@ class UncertaintyDiscountedReward:
         question = {"prompts": prompts, "completions": completions, "completion_ids": completion_ids}
         answers = ask(asked, {**question, "log_extra": log_extra, "log_metric": log_metric, **columns})
         scores = np.stack([as_scores(name, answers[name], len(completions)) for name in self.judges], axis=1)
-        sigma_m = self._ensemble(answers.get("sigma_m"), len(completions))
+        sigma_m = self._ensemble(answers, len(completions))
         self.last = self._discount(scores, sigma_m)
         self._count(self.last)
         groups = groups_of(prompts)
@@ -239,11 +239,11 @@ class UncertaintyDiscountedReward:
             self._log_means(self.last, change, log_metric)
         return [None if math.isnan(reward) else reward for reward in self.last.reward.tolist()]
 
-    def _ensemble(self, answer: Any, size: int) -> np.ndarray:
-        """Return sigma_m (size,) from the answer of the ensemble, if there is one."""
-        if answer is None:
+    def _ensemble(self, answers: dict[str, Any], size: int) -> np.ndarray:
+        """Return sigma_m (size,) from what the ensemble answered, if there is one."""
+        if self._sigma_m is None:
             return np.zeros(size)
-        values = _checks.as_numpy("sigma_m", answer)
+        values = _checks.as_numpy("sigma_m", answers["sigma_m"])
         if values.shape == (size,):
             _checks.nonnegative("sigma_m", values)
             return values
