@@ -407,7 +407,7 @@ def test_a_factor_is_lost_where_groups_are_divided_and_only_there(tmp_path):
 
     with pytest.warns(DiscountCancelledWarning, match="scale_rewards='batch' or 'none'") as caught:
         callback = watched(doubted(), tmp_path)
-    assert len(caught) == 1
+    assert sum(warning.category is DiscountCancelledWarning for warning in caught) == 1
     assert callback.reward.tally.discounted == callback.reward.tally.cancelled == 20
     assert callback.reward.tally.shifted == 0
     watched(doubted(), tmp_path, scale_rewards="none")  # warnings are errors
@@ -595,7 +595,7 @@ def test_rloo_with_missing_scores_and_its_logs(tmp_path):
         num_generations=4,
         max_completion_length=6,
         max_steps=3,
-        learning_rate=1e-2,
+        beta=0.0,  # else TRL would load the reference model by its name
         report_to="none",
         save_strategy="no",
         logging_steps=1,
