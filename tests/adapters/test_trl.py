@@ -17,7 +17,7 @@ import pytest
 import torch
 from datasets import Dataset
 from transformers import Qwen2Config, Qwen2ForSequenceClassification, TrainerControl, TrainerState, set_seed
-from trl import GRPOConfig, RLOOConfig, RLOOTrainer
+from trl import GRPOConfig, GRPOTrainer, RLOOConfig, RLOOTrainer
 
 from uard import InvalidValueError, UnknownNameError
 from uard.adapters.trl import (
@@ -586,25 +586,29 @@ def relevant_if_there(completions, **kwargs):
     return [None if text.startswith("sun") else score for text, score in zip(completions, scores, strict=True)]
 
 
-def test_rloo_with_missing_scores_and_its_logs(tmp_path):
+@pytest.fixture(params=[(GRPOTrainer, GRPOConfig), (RLOOTrainer, RLOOConfig)], ids=["grpo", "rloo"])
+def with_gaps(request, tmp_path):
+    """A short run of each trainer in which some completions get no score."""
+    trainer_class, config = request.param
     reward = UncertaintyDiscountedReward([sometimes, relevant_if_there])
     set_seed(0)
-    args = RLOOConfig(
+    args = config(
         output_dir=str(tmp_path),
         per_device_train_batch_size=16,
         num_generations=4,
         max_completion_length=6,
         max_steps=3,
-        beta=0.0,  # else TRL would load the reference model by its name
+        beta=0.0,  # else TRL would load a reference model by its name
         report_to="none",
         save_strategy="no",
         logging_steps=1,
         log_completions=True,
+        num_completions_to_print=1,
         disable_tqdm=True,
         use_cpu=True,
         bf16=False,
     )
-    trainer = RLOOTrainer(
+    trainer = trainer_class(
         model=example.language_model(0),
         reward_funcs=reward,
         args=args,
@@ -614,19 +618,25 @@ def test_rloo_with_missing_scores_and_its_logs(tmp_path):
     )
     with pytest.warns(UnscoredWarning):
         trainer.train()
+    return reward, trainer
+
+
+def test_training_with_missing_scores_stays_finite_and_says_so(with_gaps, tmp_path):
+    reward, trainer = with_gaps
     steps = [entry for entry in trainer.state.log_history if "uard/weight" in entry]
     assert len(steps) == 3
     assert reward.tally.completions == 3 * 16
     assert 0 < reward.tally.unscored == reward.tally.missing["sometimes"]
     assert np.mean([entry["uard/unscored"] for entry in steps]) == pytest.approx(reward.tally.unscored / 48)
     assert all(np.isfinite([entry["loss"], entry["reward"], entry["grad_norm"]]).all() for entry in steps)
+    if not isinstance(trainer, GRPOTrainer):
+        return  # RLOO prints the table of completions, but does not write it
     table = pd.concat(pd.read_parquet(file) for file in sorted((tmp_path / "completions").glob("*.parquet")))
     assert len(table) == 48
-    dropped = table[table["uard"].isna()]
+    dropped, kept = table[table["uard"].isna()], table[table["uard"].notna()]
     assert len(dropped) == reward.tally.unscored
     assert dropped["completion"].str.startswith("sun").all()
     assert (dropped["advantage"] == 0).all()
-    kept = table[table["uard"].notna()]
     assert kept["uard/weight"].between(0, 1).all()
     assert (kept["uard/sometimes"] == kept["completion"].str.len()).all()
 
