@@ -11,8 +11,10 @@ from typing import Any
 try:
     from transformers import TrainerCallback
     from transformers.trainer_utils import PREFIX_CHECKPOINT_DIR
-except ImportError as error:
-    raise ImportError("ReliabilityCallback needs transformers: pip install 'uard[trl]'") from error
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        f"ReliabilityCallback needs transformers: pip install 'uard[trl]' ({error})", name=error.name
+    ) from error
 
 from uard import _checks
 from uard.adapters.trl import UncertaintyDiscountedReward, keeps_factor
@@ -65,7 +67,9 @@ class ReliabilityCallback(TrainerCallback):
         self._warned: set[str] = set()
 
     def on_train_begin(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
-        """Give the reward back what it knew, if training is resumed."""
+        """Log what this configuration leaves of the discount; if training is resumed, restore what the reward knew."""
+        factor = "survives" if keeps_factor(args) else "is lost: advantages are divided by the deviation of their group"
+        log.info("a weight that all completions of a prompt share %s", factor)
         if state.global_step == 0:
             return
         file = _file(args, state)

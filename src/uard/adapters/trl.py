@@ -203,6 +203,9 @@ class UncertaintyDiscountedReward:
 
     @memory.setter
     def memory(self, memory: Any) -> None:
+        names = list(memory[0].missing)
+        if names != list(self.judges):
+            raise _checks.InvalidValueError("judges", list(self.judges), f"{names}, those that the memory is of")
         self.tally, self._scales, self._members, self._stream = memory
 
     def __call__(
