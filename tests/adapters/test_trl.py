@@ -173,6 +173,13 @@ def test_missing_scores_are_counted_and_change_nothing_for_the_others():
     assert reward.tally.unscored == 2
 
 
+def test_a_batch_without_any_score():
+    reward = UncertaintyDiscountedReward(panel([None, None], [None, None]))
+    with pytest.warns(UnscoredWarning, match="2 of 2"):
+        assert ask(reward, 2, log_extra=lambda *_: None, log_metric=lambda *_: None) == [None, None]
+    assert reward.tally.unscored == 2
+
+
 def test_a_score_that_nobody_checks_is_believed_as_little_as_an_unrated_step():
     reward = UncertaintyDiscountedReward(panel([0, 2, 4], [0, 2, None]), scales=AS_THEY_ARE[:2])
     # 0.1 is the mitigation's weight of what is unrated; what a completion is worth at least is 1 on average.
@@ -314,7 +321,7 @@ def nothing(**kwargs):
         ([broken], {}, r"judges = \['broken'\]: must be at least two: one never disagrees with itself"),
         ([broken, broken], {}, r"names of the judges = \['broken', 'broken'\]: must be different names"),
         ([functools.partial(broken), broken], {}, "must be different names"),
-        ({"sigma_m": broken, "b": broken}, {}, "none of them 'sigma_m'"),
+        ({"weight": broken, "b": broken}, {}, "none of raw, sigma_h, sigma_m, weight"),
         ([broken, 3], {}, "judge 'int' = 3: must be a reward function or a RewardModel"),
         ([broken, nothing], {"weights": [1]}, r"len\(weights\) = 1: must be 2, one per judge"),
         ([broken, nothing], {"weights": [1, 0]}, r"weights\[1\] = 0: must be a finite number > 0"),

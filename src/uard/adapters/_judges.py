@@ -21,6 +21,7 @@ from uard import _checks
 Judge = Callable[..., Any]
 
 EQUAL = 1e-9  # relative deviation at which numbers count as equal
+RESERVED = {"raw", "weight", "sigma_h", "sigma_m"}  # names of other columns in the logs
 
 
 class JudgeError(RuntimeError):
@@ -82,8 +83,8 @@ def by_name(judges: Mapping[str, Judge] | Sequence[Judge]) -> dict[str, Judge]:
             raise _checks.InvalidValueError(f"judge {name!r}", type(judge), "a function: RewardModel(model, tokenizer)")
         if not callable(judge):
             raise _checks.InvalidValueError(f"judge {name!r}", judge, "a reward function or a RewardModel")
-    if len(set(names)) < len(names) or "sigma_m" in names:
-        allowed = "different names, none of them 'sigma_m': give the judges as a dictionary"
+    if len(set(names)) < len(names) or RESERVED & set(names):
+        allowed = f"different names, none of {', '.join(sorted(RESERVED))}: give the judges as a dictionary"
         raise _checks.InvalidValueError("names of the judges", names, allowed)
     return dict(pairs)
 

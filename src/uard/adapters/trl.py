@@ -299,7 +299,7 @@ class UncertaintyDiscountedReward:
         tally.unscored += int(unscored.sum())
         tally.unchecked += int(((~np.isnan(judged.ratings)).sum(1) < 2)[~unscored].sum())
         tally.weight += float(np.nansum(judged.weight))
-        tally.widest = float(np.nanmax(judged.sigma_h, initial=tally.widest))
+        tally.widest = float(np.max(judged.sigma_h, initial=tally.widest, where=~unscored))
 
     def _count_groups(self, judged: Judged, groups: np.ndarray, change: np.ndarray) -> None:
         discounted = ~np.isnan(change) & (_group_means(judged.weight, groups) < DISCOUNTED)
