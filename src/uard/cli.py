@@ -1,4 +1,7 @@
-"""The command line: ``uard run``, ``reproduce``, ``ledger``, ``list``. A command imports what it needs when it runs."""
+"""The command line: ``uard run``, ``reproduce``, ``ledger``, ``leaderboard``, ``list``.
+
+A command imports what it needs when it runs.
+"""
 
 from __future__ import annotations
 
@@ -111,6 +114,16 @@ class Ledger:
 
 
 @dataclass(frozen=True)
+class Leaderboard:
+    """Write a page that ranks mitigations over everything that a store holds, your own included."""
+
+    store: str = DEFAULT_STORE
+    """Where finished seeds are kept; nothing is trained."""
+    out: str = "leaderboard.html"
+    """The page."""
+
+
+@dataclass(frozen=True)
 class List:
     """List environments, agents, mitigations, panels and studies."""
 
@@ -119,6 +132,7 @@ Command = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
     | Annotated[Ledger, tyro.conf.subcommand("ledger")]
+    | Annotated[Leaderboard, tyro.conf.subcommand("leaderboard")]
     | Annotated[List, tyro.conf.subcommand("list")]
 )
 
@@ -142,7 +156,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     except ModuleNotFoundError as error:
         sys.exit(f"{_NEEDS_LAB} ({error})")
     try:
-        {Run: _run, Reproduce: _reproduce, Ledger: _ledger, List: _list}[type(command)](command, console)
+        {Run: _run, Reproduce: _reproduce, Ledger: _ledger, Leaderboard: _leaderboard, List: _list}[type(command)](
+            command, console
+        )
     except (ClusterError, InvalidValueError, StoreError) as error:
         console.print(f"[red]error:[/red] {_escape(str(error))}", soft_wrap=True)
         sys.exit(2)
@@ -337,7 +353,7 @@ def _reproduce(command: Reproduce, console: Console) -> None:
         from uard.reporting import page
 
         with console.status("writing the report"):
-            written = page.write(Path(command.report), store, seeds)
+            written = page.write(Path(command.report), store, seeds, command.mitigation)
         console.print(f"report: {written}")
     else:
         from rich.console import Console
@@ -371,6 +387,15 @@ def _ledger(command: Ledger, console: Console) -> None:
         _write_json(ledger.as_data(entries, seeds), command.json)
     if command.json != "-":
         ledger.to_rich(entries)
+
+
+def _leaderboard(command: Leaderboard, console: Console) -> None:
+    from uard.lab.store import Store
+    from uard.reporting import leaderboard
+
+    if not Path(command.store).is_file():
+        raise _invalid("store", command.store, "a file that is there; `uard reproduce` and `uard run --store` make one")
+    console.print(f"leaderboard: {leaderboard.write(Path(command.out), Store(command.store))}", soft_wrap=True)
 
 
 def _list(command: List, console: Console) -> None:

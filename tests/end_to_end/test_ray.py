@@ -2,15 +2,13 @@ import importlib
 import os
 import socket
 import sqlite3
-import subprocess
 import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 
-from uard import InvalidValueError, LearningSignal, Mitigation
+from uard import InvalidValueError, LearningSignal, Mitigation, cli
 from uard.agents.tabular import QLearning
 from uard.envs.trapgrid import TrapGrid
 from uard.lab import cluster, runner
@@ -23,7 +21,6 @@ from uard.mitigation import named
 pytestmark = pytest.mark.slow
 ray = pytest.importorskip("ray", reason="the extra uard[ray] is not installed")
 
-UARD = Path(sys.executable).parent / "uard"
 GRID = TrapGrid(size=4, traps=((1, 2),), horizon=8)
 WALKER = QLearning(heads=1, epsilon=1.0, epsilon_decay=1.0, epsilon_min=1.0)
 ALONE = """
@@ -105,8 +102,8 @@ def test_a_lost_node_changes_no_byte_of_the_results(cluster_of_two, tmp_path):
     there.close()
 
 
-def test_what_fails_is_told_apart_and_the_rest_is_stored(cluster_of_two, alone, monkeypatch):
-    """On a connection that is the user's own, and stays."""
+def test_what_fails_is_told_apart_and_the_rest_is_stored(alone, monkeypatch):
+    """On a Ray that is started for it, and ended."""
 
     @dataclass(frozen=True)
     class Local(Mitigation):
@@ -114,25 +111,31 @@ def test_what_fails_is_told_apart_and_the_rest_is_stored(cluster_of_two, alone, 
             return LearningSignal(evidence.reward, 1.0)
 
     monkeypatch.setattr(cluster, "RETRIES", 0)
-    ray.init(cluster_of_two[0].address, log_to_driver=False, logging_level="ERROR")
-    store, bad = Store(":memory:"), [small(alone.Unknown()), small(Dies())]
-    good = [small(), small(Local())]
+    store, bad, good = Store(":memory:"), [small(alone.Unknown()), small(Dies())], [small(), small(Local())]
     with pytest.raises(StudyFailedError) as caught:
         runner.run([(c, 0) for c in (*bad, *good)], store, engine=Ray())
+    assert not ray.is_initialized()
     errors = {f.jobs[0][0]: f.error for f in caught.value.failures}
     assert errors.keys() == set(bad)
     assert "No module named 'ray_alone'" in errors[bad[0]]
     assert errors[bad[1]].startswith("the batch was lost with its worker or node 1 times")
     assert [store.have(c) for c in good] == [{0}, {0}]
+    store.close()
 
+
+def test_a_connection_of_the_users_own_is_used_and_stays(cluster_of_two, alone, monkeypatch):
+    """With a package that no node has, and for more than the nodes have."""
+    ray.init(cluster_of_two[0].address, log_to_driver=False, logging_level="ERROR")
     monkeypatch.setattr(cluster, "_there", alone.elsewhere)
-    with pytest.raises(StudyFailedError, match="must be installed on every node of the cluster"):
-        runner.run([(small(), 1)], store, engine=Ray())
-    with pytest.raises(ClusterError, match=r"no node of the Ray cluster has 1 CPU and 1 GPU for a task; all have"):
-        runner.run([(small(), 1)], store, engine=Ray(gpus=1))
+    batch = [(small(), 1)]
+    ((back, answer),) = Ray()([batch], None, list)
+    assert back == batch
+    assert answer.endswith("(and your own package) must be installed on every node of the cluster")
+    with pytest.raises(ClusterError, match=r"no node of the Ray cluster has 1 CPU and 1 GPU for a task; it has"):
+        list(Ray(gpus=1)([batch], None, list))
+    assert list(Ray()([batch], None, lambda batch: [])) == []
     assert ray.is_initialized()
     ray.shutdown()
-    store.close()
 
 
 def test_a_node_of_other_versions_is_refused():
@@ -165,13 +168,15 @@ def test_a_share_of_gpus_that_is_none_is_refused(gpus):
         Ray(gpus=gpus)
 
 
-def test_the_command_line_starts_a_ray_of_its_own(tmp_path):
-    """And the second time there is nothing left to do."""
-    command = [UARD, "reproduce", "control", "--seeds", "2", "--engine", "ray"]
-    command += ["--store", str(tmp_path / "s.sqlite")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "8 runs trained, 0 were in" in " ".join(done.stderr.split())
+def uard(capsys, tmp_path, *options):
+    cli.main(["reproduce", "control", "--seeds", "2", "--store", str(tmp_path / "s.sqlite"), *options])
+    return " ".join(capsys.readouterr().err.split())
+
+
+def test_the_command_line_trains_on_a_cluster(cluster_of_two, capsys, tmp_path):
+    options = ("--engine", "ray", "--address", cluster_of_two[0].address)
+    assert "8 runs trained, 0 were in" in uard(capsys, tmp_path, *options)
+    assert "0 runs trained, 8 were in" in uard(capsys, tmp_path, *options)
 
 
 @pytest.mark.parametrize(
@@ -180,18 +185,18 @@ def test_the_command_line_starts_a_ray_of_its_own(tmp_path):
         (("--engine", "ray", "--address", "127.0.0.1:1"), "no Ray cluster answers there"),
         (("--engine", "ray", "--workers", "2"), "workers = 2: must be left out with --engine ray"),
         (("--address", "auto"), "address = 'auto': must be left out without --engine ray"),
+        (("--gpus", "0.5"), "gpus = 0.5: must be left out without --engine ray"),
         (("--engine", "rai"), "one of local, ray (did you mean 'ray'?)"),
     ],
 )
-def test_what_does_not_go_together_is_said(tmp_path, options, says):
-    command = [UARD, "reproduce", "control", "--store", tmp_path / "s.sqlite", *options]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert says in " ".join(done.stderr.split())
-    assert "Traceback" not in done.stderr
+def test_what_does_not_go_together_is_said(capsys, tmp_path, options, says):
+    with pytest.raises(SystemExit) as left:
+        uard(capsys, tmp_path, *options)
+    assert left.value.code == 2
+    assert says in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_missing_ray_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ClusterError, match=r"pip install 'uard\[ray\]'"):
-        list(Ray()([[(small(), 0)]], None))
+        list(Ray()([[(small(), 0)]], None, list))

@@ -23,7 +23,7 @@ from typing import Any
 
 from uard import _checks
 from uard.lab import runner
-from uard.lab.runner import Answer, Job, Outcomes
+from uard.lab.runner import Answer, Claim, Job, Outcomes
 
 RETRIES = 5  # nodes that may be lost under one batch before it counts as failed
 AHEAD = 2  # batches handed out per slot of the cluster, so that none waits for the driver
@@ -60,22 +60,25 @@ class Ray:
                 allowed = "host:port of the cluster's head (run this command on one of its nodes), auto, or left out"
                 raise _checks.InvalidValueError("address", self.address, allowed)
 
-    def __call__(self, queue: list[list[Job]], folder: Path | None) -> Outcomes:
+    def __call__(self, queue: list[list[Job]], folder: Path | None, claim: Claim) -> Outcomes:
         """Train batches on the cluster; yield each with its answers as soon as they are there.
 
         Args:
             queue: Batches, the longest first.
-            folder: The driver's folder of checkpoints, which other nodes need not see and which is therefore not used.
+            folder: The driver's folder of checkpoints. Other nodes need not see it, so only a batch that cannot be
+                pickled, and is therefore trained in this process, uses it.
+            claim: Says what of a batch is to be trained, when it is handed out.
 
         Raises:
             ClusterError: Ray is not installed, no cluster answers, or it has no room for a single task.
         """
         local: list[list[Job]] = []
         with _connected(self.address) as ray:
-            yield from self._train(ray, queue, local)
-        yield from runner._here(local, folder)
+            yield from self._train(ray, queue, claim, local)
+        for batch in local:
+            yield batch, runner._attempt(lambda batch=batch: (batch, folder))
 
-    def _train(self, ray: Any, queue: list[list[Job]], local: list[list[Job]]) -> Outcomes:
+    def _train(self, ray: Any, queue: list[list[Job]], claim: Claim, local: list[list[Job]]) -> Outcomes:
         """Train what can be pickled; the rest is left in ``local``."""
         if not self._slots(ray):
             have = {k: v for k, v in ray.cluster_resources().items() if k in ("CPU", "GPU")}
@@ -84,7 +87,7 @@ class Ray:
             )
         task = ray.remote(_there).options(num_cpus=1, num_gpus=self.gpus, max_retries=RETRIES)
         versions = {package: _version(package) for package in NEEDED}
-        waiting = iter(queue)
+        waiting = (mine for batch in queue if (mine := claim(batch)))
         flying: dict[Any, list[Job]] = {}
 
         def launch() -> None:

@@ -212,7 +212,7 @@ def run(
         progress(0, len(todo))
     folder = None if store.path == ":memory:" else Path(f"{store.path}-checkpoints")
     if engine is not None:
-        outcomes = engine(queue, folder)
+        outcomes = engine(queue, folder, list)
     else:
         outcomes = _here(queue, folder) if workers <= 1 or len(queue) == 1 else _spread(queue, workers, folder)
     for batch, answer in outcomes:
@@ -252,8 +252,8 @@ def _kept(answer: Result | DivergedError | str, store: Store) -> Result | str:
 # Per job its result, the divergence or a traceback; or one traceback for all of them.
 Answer = list[Result | DivergedError | str] | str
 Outcomes = Iterable[tuple[list[Job], Answer]]
-# Of batches, the longest first, and a folder for checkpoints.
-Engine = Callable[[list[list[Job]], Path | None], Outcomes]
+Claim = Callable[[list[Job]], list[Job]]  # of a batch, what of it is to be trained: called when it is handed out
+Engine = Callable[[list[list[Job]], Path | None, Claim], Outcomes]  # of batches (longest first), a folder, a claim
 
 
 def _here(queue: Iterable[list[Job]], folder: Path | None) -> Outcomes:
