@@ -31,10 +31,10 @@ class Ceiling(Mitigation):
             raise InvalidValueError("slack", self.slack, "a number >= 0")
 
     def signal(self, evidence: Any, usual: Any) -> LearningSignal:
-        """Return the smaller of reward and ceiling (written so that any array library can)."""
+        """Return the smaller of reward and ceiling."""
         known = evidence.feedback.count > 0
-        excess = evidence.reward - (evidence.feedback.mean * known + self.slack)
-        return LearningSignal(evidence.reward - (excess > 0) * excess, 1.0)
+        ceiling = jnp.where(known, evidence.feedback.mean, 0.0) + self.slack
+        return LearningSignal(jnp.minimum(evidence.reward, ceiling), 1.0)
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,8 @@ def find(names: tuple[str, ...], mitigations: tuple[str, ...] = ()) -> tuple[Stu
         UnknownNameError: with the nearest name.
         InvalidValueError: mitigations are to join, and none of the studies compares any.
     """
-    known = {s.name: (s,) for s in every()} | groups()
+    together = groups()
+    known = {s.name: (s,) for group in together.values() for s in group} | together
     chosen: dict[str, Study] = {}
     for name in names or ("grid",):
         chosen |= {s.name: s for s in known[_checks.choose("study", name, known)]}
