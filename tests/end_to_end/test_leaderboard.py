@@ -129,7 +129,7 @@ def _where(line):
 def _where_of(cell):
     env = cell.environment
     name = "TrapGrid6-Legitimate" if env.legitimate else "TrapGrid"
-    name = "TrapGrid6" if env.size == 6 else f"{name}, size 4, traps [[1,2]], goal [3,3], horizon 12"
+    name = "TrapGrid6" if env.size == 6 else f"{name}, goal [3,3], horizon 12, size 4, traps [[1,2]]"
     return name, "–" if _name(cell) == "raw" else cell.panel, cell.noise
 
 

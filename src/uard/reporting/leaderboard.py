@@ -300,7 +300,7 @@ def _leaves(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _different(leaves: dict[str, Any], base: dict[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in leaves.items() if k not in base or base[k] != v}
+    return {k: v for k, v in sorted(leaves.items()) if k not in base or base[k] != v}
 
 
 def _said(name: str, value: Any) -> str:
