@@ -1,8 +1,8 @@
-"""What docs/guides/cluster.md computes with: CPU seconds of cells, bytes of results, rates of the driver.
+"""What docs/guides/cluster.md computes with.
 
-python benchmarks/cluster.py cells     # each family: CPU seconds per seed, compilation apart
-python benchmarks/cluster.py store     # bytes per seed, seeds written per CPU second
-python benchmarks/cluster.py driver    # batches handed out and taken in per CPU second of the driver (needs Ray)
+``python benchmarks/cluster.py cells``: CPU seconds per seed of each family, compilation apart. ``... store``: bytes per
+seed, and seeds written per CPU second. ``... driver``: batches handed out and taken in per CPU second of the driver
+(needs the extra ``uard[ray]``).
 """
 
 from __future__ import annotations
