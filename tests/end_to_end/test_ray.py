@@ -168,15 +168,10 @@ def test_a_share_of_gpus_that_is_none_is_refused(gpus):
         Ray(gpus=gpus)
 
 
-def uard(capsys, tmp_path, *options):
-    cli.main(["reproduce", "control", "--seeds", "2", "--store", str(tmp_path / "s.sqlite"), *options])
-    return " ".join(capsys.readouterr().err.split())
-
-
-def test_the_command_line_trains_on_a_cluster(cluster_of_two, capsys, tmp_path):
-    options = ("--engine", "ray", "--address", cluster_of_two[0].address)
-    assert "8 runs trained, 0 were in" in uard(capsys, tmp_path, *options)
-    assert "0 runs trained, 8 were in" in uard(capsys, tmp_path, *options)
+def test_the_command_line_says_which_cluster():
+    command = cli.Reproduce(engine="ray", address="head:6379", gpus=0.5)
+    assert cli._engine(command) == Ray("head:6379", 0.5)
+    assert cli._engine(cli.Reproduce()) is None
 
 
 @pytest.mark.parametrize(
@@ -191,7 +186,7 @@ def test_the_command_line_trains_on_a_cluster(cluster_of_two, capsys, tmp_path):
 )
 def test_what_does_not_go_together_is_said(capsys, tmp_path, options, says):
     with pytest.raises(SystemExit) as left:
-        uard(capsys, tmp_path, *options)
+        cli.main(["reproduce", "control", "--seeds", "2", "--store", str(tmp_path / "s.sqlite"), *options])
     assert left.value.code == 2
     assert says in " ".join(capsys.readouterr().err.split())
 

@@ -13,6 +13,7 @@ import socket
 import subprocess
 import sys
 import traceback
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -82,9 +83,7 @@ class Ray:
         """Train what can be pickled; the rest is left in ``local``."""
         if not self._slots(ray):
             have = {k: v for k, v in ray.cluster_resources().items() if k in ("CPU", "GPU")}
-            raise ClusterError(
-                f"no node of the Ray cluster has 1 CPU and {self.gpus:g} GPU for a task; all have {have}"
-            )
+            raise ClusterError(f"no node of the Ray cluster has 1 CPU and {self.gpus:g} GPU for a task; it has {have}")
         task = ray.remote(_there).options(num_cpus=1, num_gpus=self.gpus, max_retries=RETRIES)
         versions = {package: _version(package) for package in NEEDED}
         waiting = (mine for batch in queue if (mine := claim(batch)))
@@ -163,7 +162,10 @@ def _connected(address: str | None) -> Iterator[Any]:
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        ray.init(address="local", num_cpus=cores, include_dashboard=False, **quiet)
+        with warnings.catch_warnings():
+            # JAX warns of forks, for it has threads; Ray's children use no JAX and replace themselves at once.
+            warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+            ray.init(address="local", num_cpus=cores, include_dashboard=False, **quiet)
     else:
         _check_alive(address)
         try:
