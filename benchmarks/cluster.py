@@ -28,9 +28,8 @@ def cells():
     deep = {"feedback": RatingModel()}
     for name, cell, seeds in (
         ("tabular", Cell(paper_grid(10), named("uard")), runner.BATCH),
-        ("dqn", Cell(paper_grid(10), named("uard"), names.AGENTS["dqn"], **deep), runner.DEEP_BATCH),
-        ("ensemble-dqn", Cell(paper_grid(10), named("uard"), names.AGENTS["ensemble-dqn"], **deep), 2),
-        ("ppo", Cell(paper_grid(10), named("uard"), names.AGENTS["ppo"], **deep), runner.DEEP_BATCH),
+        ("dqn", Cell(paper_grid(10), named("uard"), names.AGENTS["dqn"], **deep), 1),
+        ("ppo", Cell(paper_grid(10), named("uard"), names.AGENTS["ppo"], **deep), 1),
     ):
         taken, results = [], []
         for first in (0, seeds):

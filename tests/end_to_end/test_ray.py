@@ -59,6 +59,7 @@ def cluster_of_two():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_worker_niceness", "0")  # Ray's 15 starves on a busy machine
         made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
         nodes = [made.add_node(num_cpus=1, wait=False), made.add_node(num_cpus=1, wait=False)]
         made.wait_for_nodes()
@@ -111,6 +112,7 @@ def test_what_fails_is_told_apart_and_the_rest_is_stored(alone, monkeypatch):
             return LearningSignal(evidence.reward, 1.0)
 
     monkeypatch.setattr(cluster, "RETRIES", 0)
+    monkeypatch.setenv("RAY_worker_niceness", "0")
     store, bad, good = Store(":memory:"), [small(alone.Unknown()), small(Dies())], [small(), small(Local())]
     with pytest.raises(StudyFailedError) as caught:
         runner.run([(c, 0) for c in (*bad, *good)], store, engine=Ray())
