@@ -18,7 +18,12 @@ from uard.lab.runner import StudyFailedError
 from uard.lab.store import Store
 from uard.mitigation import named
 
-pytestmark = pytest.mark.slow
+# Ray leaves its own processes to end on their own.
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore:subprocess .* is still running:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
 ray = pytest.importorskip("ray", reason="the extra uard[ray] is not installed")
 
 GRID = TrapGrid(size=4, traps=((1, 2),), horizon=8)

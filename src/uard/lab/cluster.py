@@ -160,22 +160,31 @@ def _connected(address: str | None) -> Iterator[Any]:
         yield ray
         return
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
-    if address is None:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        with warnings.catch_warnings():
-            # JAX warns of forks, for it has threads; Ray's children use no JAX and replace themselves at once.
-            warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
-            ray.init(address="local", num_cpus=cores, include_dashboard=False, **quiet)
-    else:
-        _check_alive(address)
-        try:
+    try:
+        if address is None:
+            _start(ray, quiet)
+        else:
+            _check_alive(address)
             ray.init(address=address, **quiet)
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            raise _silent(address, error) from None
+    except ClusterError:
+        raise
+    except Exception as error:  # a bare Exception is what Ray raises if its own processes start too slowly
+        ray.shutdown()
+        if address is None:
+            raise ClusterError(f"Ray could not be started on this machine: {error}") from error
+        raise _silent(address, error) from error
     try:
         yield ray
     finally:
         ray.shutdown()
+
+
+def _start(ray: Any, quiet: dict[str, Any]) -> None:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    with warnings.catch_warnings():
+        # JAX warns of forks, for it has threads; Ray's children use no JAX and replace themselves at once.
+        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+        ray.init(address="local", num_cpus=cores, include_dashboard=False, **quiet)
 
 
 def _check_alive(address: str, patience: float = 20.0) -> None:
