@@ -67,6 +67,22 @@ class LearningSignal(NamedTuple):
     sample_weight: Array
 
 
+class Explanation(NamedTuple):
+    """Why a reward is believed as far as it is; arrays of one shape.
+
+    Attributes:
+        sigma_h: Disagreement of the raters (and the proxy, if it counts), in reward units.
+        lam: lambda_t.
+        weight: w in [0, 1].
+        anchor: b, in reward units; what is learned from is b + w (r - b).
+    """
+
+    sigma_h: Array
+    lam: Array
+    weight: Array
+    anchor: Array
+
+
 class Usual(NamedTuple):
     """What is usual over the distinct state-actions rated so far.
 
@@ -273,6 +289,12 @@ class RewardDiscounting(Mitigation):
 
     def weight(self, mu: Array, proxy: Array, sigma_m: Array, feedback: Feedback, usual: Usual) -> Array:
         """Return w for something of size ``mu`` whose observed reward is ``proxy``."""
+        return self._weigh(mu, proxy, sigma_m, feedback, usual)[0]
+
+    def _weigh(
+        self, mu: Array, proxy: Array, sigma_m: Array, feedback: Feedback, usual: Usual
+    ) -> tuple[Array, Array, Array]:
+        """Return w, sigma_h and lambda_t."""
         sigma_h = self.disagreement(proxy, feedback)
         lam = self.coefficient(sigma_h, usual)
         unit = usual.scale if self.standardise else 1.0
@@ -281,18 +303,25 @@ class RewardDiscounting(Mitigation):
         )
         # A factor, not a mixture: where nobody has rated, the ensemble's doubt still counts.
         one = namespace(weight).ones_like(weight)
-        return weight * uncertainty.shrink(one, feedback.count, self.unrated_weight, self.prior_count)
+        weight = weight * uncertainty.shrink(one, feedback.count, self.unrated_weight, self.prior_count)
+        return weight, sigma_h, lam
 
-    def signal(self, evidence: Evidence, usual: Usual) -> LearningSignal:
-        """Return b + w (r - b), or the observed reward if only scores are discounted."""
+    def explain(self, evidence: Evidence, usual: Usual) -> Explanation:
+        """Return weight and anchor of a reward, and what they were made from."""
         f, r = evidence.feedback, evidence.reward
-        if self.acts_on == "score":
-            return LearningSignal(r, 1.0)
         if self.anchor == "zero":
             anchor = 0.0 * r
         else:
             anchor = uncertainty.shrink(f.lowest, f.count, usual.lowest, self.prior_count)
-        return LearningSignal(discount(r, self.weight(r - anchor, r, evidence.sigma_m, f, usual), anchor), 1.0)
+        weight, sigma_h, lam = self._weigh(r - anchor, r, evidence.sigma_m, f, usual)
+        return Explanation(sigma_h, lam, weight, anchor)
+
+    def signal(self, evidence: Evidence, usual: Usual) -> LearningSignal:
+        """Return b + w (r - b), or the observed reward if only scores are discounted."""
+        if self.acts_on == "score":
+            return LearningSignal(evidence.reward, 1.0)
+        why = self.explain(evidence, usual)
+        return LearningSignal(discount(evidence.reward, why.weight, why.anchor), 1.0)
 
     def score(self, mu: Array, sigma_m: Array, feedback: Feedback, usual: Usual) -> Array:
         """Return J, or ``mu`` if only rewards are discounted."""

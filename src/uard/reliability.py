@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 from array_api_compat import array_namespace
 
 from uard import _checks
@@ -17,15 +18,13 @@ from uard import _checks
 Array = Any
 Form = Literal["reciprocal", "exponential", "linear", "certainty-equivalent", "wiener"]
 FORMS: tuple[Form, ...] = ("reciprocal", "exponential", "linear", "certainty-equivalent", "wiener")
+_NUMPY = (np.ndarray, np.generic)
 
 
 def namespace(*arrays: Array) -> Any:
     """Return the array namespace of the arguments; plain numbers are NumPy's, and NumPy's give way to others."""
-    import numpy as np
-
-    found = [a for a in arrays if hasattr(a, "shape")]
-    others = [a for a in found if not isinstance(a, np.ndarray | np.generic)]
-    return array_namespace(*(others or found)) if found else np
+    others = [a for a in arrays if hasattr(a, "shape") and not isinstance(a, _NUMPY)]
+    return array_namespace(*others) if others else np
 
 
 def total_uncertainty(sigma_m: Array, sigma_h: Array, alpha: Array = 0.5, beta: Array = 0.5) -> Array:
@@ -95,8 +94,6 @@ def wiener_weight(signal: Array, noise: Array) -> Array:
 
 def _as_array_like(other: Array, value: Array) -> Array:
     """Broadcast ``value`` against ``other`` so that it is an array."""
-    import numpy as np
-
     total = value + 0.0 * other
     return total if hasattr(total, "shape") else np.asarray(total)
 

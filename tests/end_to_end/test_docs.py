@@ -14,12 +14,15 @@ from uard.lab.store import Store
 from uard.reporting.evidence import Evidence
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.M | re.S)
 
 
 def blocks(language: str) -> dict[str, str]:
-    found = {p.name: "\n".join(code for lang, code in BLOCK.findall(p.read_text()) if lang == language) for p in PAGES}
+    found = {
+        str(p.relative_to(ROOT)): "\n".join(code for lang, code in BLOCK.findall(p.read_text()) if lang == language)
+        for p in PAGES
+    }
     return {name: code for name, code in found.items() if code.strip()}
 
 

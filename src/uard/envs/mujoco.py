@@ -18,6 +18,7 @@ Physics, task reward, observation and the end of an episode are Gymnasium's v4 o
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -307,9 +308,10 @@ class Physics:
         self._parts = [p for p in np.array_split(np.arange(copies), threads) if len(p)]
         self._pool = ThreadPoolExecutor(len(self._parts)) if len(self._parts) > 1 else None
         for i in range(copies):
-            self._reset(i)
+            self.reset(i)
 
-    def _reset(self, i: int) -> None:
+    def reset(self, i: int) -> None:
+        """Stand copy ``i`` up again, with Gymnasium's noise."""
         data, m = self._data[i], self._model
         self._mujoco.mj_resetData(m, data)
         data.qpos[:] = m.qpos0 + self._random.uniform(-NOISE, NOISE, m.nq)
@@ -379,7 +381,7 @@ class Physics:
         self._time += 1
         truncated = (self._time >= spec.horizon) & ~terminated
         for i in np.nonzero(terminated | truncated)[0]:
-            self._reset(int(i))
+            self.reset(int(i))
         return Moved(observation, reward, terminated, truncated, true, hack, task)
 
     def _healthy(self, observation: Array) -> Array:
@@ -424,6 +426,22 @@ class Physics:
         words = [int(w) for w in saved["random"]]
         state = {"state": words[0] | words[1] << 64, "inc": words[2] | words[3] << 64}
         self._random.bit_generator.state = {"bit_generator": "PCG64", "state": state, "has_uint32": 0, "uinteger": 0}
+
+    def camera(self, height: int = 240, width: int = 320) -> Callable[[int], Array]:
+        """Return what takes a picture (height, width, 3) of a copy, from the side, following it.
+
+        Needs a graphics library; without a screen set the environment variable MUJOCO_GL to egl or osmesa.
+        """
+        renderer = self._mujoco.Renderer(self._model, height, width)
+        follow = self._mujoco.MjvCamera()
+        follow.type, follow.trackbodyid = self._mujoco.mjtCamera.mjCAMERA_TRACKING, 1
+        follow.distance, follow.elevation, follow.azimuth = 4.0, -10.0, 90.0
+
+        def picture(i: int) -> Array:
+            renderer.update_scene(self._data[i], follow)
+            return renderer.render()
+
+        return picture
 
     def close(self) -> None:
         """Let the threads go."""

@@ -2,7 +2,7 @@
 
 A verdict on a number is computed from it by the condition beside it. Where a claim has parts that no number answers (a
 derivation, a cross-reference, MuJoCo), that part is our reading of the text, and ``why`` says so. Claims about deep agents are answered
-from the published results; those about MuJoCo stand here as "cannot be tested" with the reason until it is run.
+from the published results, those about MuJoCo too.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from uard import __version__, statistics
 from uard.reliability import ReliabilityFilter, reciprocal_weight, wiener_weight
-from uard.reporting import deep, paper, published, theory
+from uard.reporting import deep, locomotion, paper, published, theory
 from uard.reporting.evidence import Evidence
 from uard.reporting.tables import full, number
 from uard.statistics import Summary
@@ -480,13 +480,25 @@ def _j16(e: Evidence) -> _Answer:
     reached = _reduction(ours, base)
     printed = paper.PERCENT["hacking"].value
     good = [reached >= printed, goal.mean > 0.5, False]
-    why = f"On the grid the number is reached, and means little: a random walker has {_percent(_reduction(walker, base))}, and UARD as printed reaches the goal in {_percent(100 * goal.mean)} of episodes. MuJoCo: not on this page."
+    why = f"On the grid the number is reached, and means little: a random walker has {_percent(_reduction(walker, base))}, and UARD as printed reaches the goal in {_percent(100 * goal.mean)} of episodes. {_on_mujoco()}"
     return (
         "study table3, T = 100, main panel",
         f"{_percent(reached)} ({full(ours)} against {full(base)})",
         _verdict(sum(good), 3),
         why,
     )
+
+
+def _on_mujoco() -> str:
+    p = published.packaged()
+    judged = [
+        (r, x) for r in p.rows(locomotion.HACKING, mitigation="uard") if (x := locomotion.shares(p, r)[0]) is not None
+    ]
+    judged = [(r, x) for r, x in judged if r["region"] != "none"]
+    if not judged:
+        return "MuJoCo: not published."
+    good = sum(x >= locomotion.REMOVED for _, x in judged)
+    return f"MuJoCo: the repaired uard removes that share of the raw agent's hacks in {good} of {len(judged)} settings, at least {_percent(100 * min(x for _, x in judged))}."
 
 
 @_claim("J17")
@@ -550,12 +562,57 @@ def _j20(e: Evidence) -> _Answer:
     )
 
 
-_NOT_HERE = "Needs MuJoCo; not on this page."
+_NO_MUJOCO = "-", "-", UNTESTABLE, "Its rows are not among the published results: uard reproduce mujoco-standard."
 
 
-@_claim("J21", "J36", "J45")
-def _not_here(e: Evidence) -> _Answer:
-    return "-", "-", UNTESTABLE, _NOT_HERE
+def _noisy(share: float, mitigation: str) -> np.ndarray | None:
+    """Return violations per episode of PPO on Hopper, one number per seed; None if they are not published."""
+    p = published.packaged()
+    rows = p.rows(locomotion.NOISE, agent="ppo", mitigation=mitigation, noise=share)
+    return p.per_seed(rows[0], "trap_visits") if rows else None
+
+
+_NOISY = "study mujoco-standard-noise: PPO, Hopper, vibration, main panel, steps in the region per episode"
+_DEAF = "Raw PPO reads no ratings, so the raters' noise cannot reach it; what noise the paper's baselines met it does not say."
+
+
+@_claim("J21")
+def _j21(e: Evidence) -> _Answer:
+    raw, noisy, ours = _noisy(0.0, "raw"), _noisy(0.3, "raw"), _noisy(0.3, "uard")
+    if raw is None or noisy is None or ours is None:
+        return _NO_MUJOCO
+    rise, cut = noisy.mean() / max(raw.mean(), 1e-9) - 1, 1 - ours.mean() / max(noisy.mean(), 1e-9)
+    before, after, filtered = (brief_ci(statistics.summarise(x)) for x in (raw, noisy, ours))
+    text = f"raw {before} at 0 %, {after} at 30 %; uard {filtered} at 30 %, {_percent(100 * cut)} lower"
+    return _NOISY, text, _verdict((rise >= 2.77) + (cut >= 0.983), 2), _DEAF
+
+
+@_claim("J45")
+def _j45(e: Evidence) -> _Answer:
+    noisy = _noisy(0.3, "raw")
+    if noisy is None:
+        return _NO_MUJOCO
+    return _NOISY, f"worst of {len(noisy)} seeds: {number(noisy.max())}", _verdict(int(noisy.max() > 40), 1), _DEAF
+
+
+@_claim("J36")
+def _j36(e: Evidence) -> _Answer:
+    p = published.packaged()
+    rows = p.rows(locomotion.HACKING, robot="walker2d", agent="ppo", mitigation="true reward")
+    if not rows:
+        return _NO_MUJOCO
+    returns = [p.of(r, "true_return") for r in rows]
+    text = "; ".join(f"{r['region']}: {full(s)}" for r, s in zip(rows, returns, strict=True))
+    why = (
+        "A robot that does nothing scores 95, and 110 is a fall after about 113 steps. Trained on the true reward, with "
+        "nothing to exploit, it returns far more: 350 is no sign of exploiting."
+    )
+    return (
+        "study mujoco-standard-hacking: PPO on the true reward",
+        text,
+        _verdict(int(returns[0].ci95[0] < 115), 1),
+        why,
+    )
 
 
 def _distorted(name: str) -> dict[str, Summary] | None:

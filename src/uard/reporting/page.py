@@ -16,7 +16,7 @@ from uard import InvalidValueError, __version__, statistics, studies
 from uard.lab.result import CALIBRATION, WINDOW
 from uard.lab.store import Store
 from uard.lab.study import Row
-from uard.reporting import audit, deep, figures, leaderboard, ledger, paper, published, theory
+from uard.reporting import audit, deep, figures, leaderboard, ledger, locomotion, paper, published, theory
 from uard.reporting.evidence import Evidence
 from uard.reporting.tables import Table, brief, full, number, study_table
 from uard.statistics import Summary
@@ -49,9 +49,11 @@ def write(folder: Path, store: Store, seeds: Sequence[int], mitigations: tuple[s
         seeds=len(evidence.seeds),
         window=WINDOW,
         headline=_headline(evidence),
-        losses=_losses(evidence) + deep.losses(published.packaged()),
+        losses=_losses(evidence) + deep.losses(published.packaged()) + locomotion.losses(published.packaged()),
         deep_tables=[_sources(evidence), *deep.tables(published.packaged())],
         deep_figures=deep.drawn(published.packaged()),
+        mujoco_tables=locomotion.tables(published.packaged()),
+        mujoco_figures=locomotion.drawn(published.packaged()),
         deep_made=published.packaged().sources,
         film=json.dumps(_film(evidence)),
         tables=_paper_tables(evidence),

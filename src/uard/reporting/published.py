@@ -29,7 +29,7 @@ from uard.statistics import Summary
 
 BIN = 10  # episodes
 CURVES = ("observed_return", "trap_visits", "goal")
-FILES = ("grid-deep.json", "games.json")
+FILES = ("grid-deep.json", "games.json", "mujoco.json")
 
 
 def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], command: str) -> dict[str, Any]:
@@ -43,11 +43,12 @@ def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], comman
         found = store.get(cell, seeds)
         if len(found) == len(seeds):
             cells[cell.key] = _of_cell(names, cell, found)
+    packages = ["jax", "numpy", "optax"] + (["mujoco"] if any(cell.steps for cell in wanted) else [])
     return {
         "command": command,
         "version": __version__,
         "results": RESULTS,
-        "packages": {p: metadata.version(p) for p in ("jax", "numpy", "optax")} | {"python": platform.python_version()},
+        "packages": {p: metadata.version(p) for p in packages} | {"python": platform.python_version()},
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "cells": cells,
     }
@@ -69,6 +70,9 @@ def _of_cell(studies: set[str], cell: Cell, found: dict[int, Result]) -> dict[st
             derived[name] = [[_short(x) for x in r.extra[name]] for r in results]
     if "deep-ensembles" in studies:
         derived["sigma_m"] = [[_short(x) for x in sigma_quality(cell, r)] for r in results]
+    if "evaluation" in results[0].extra:  # columns of training.lanes.LOG
+        means = [r.extra["evaluation"].mean(0) for r in results]
+        derived["deterministic"] = [[_short(m[0]), _short(m[1])] for m in means]  # hacks, true return
     if "deep-distortion" in studies:
         traces = [distortion.walk(cell, r, s) for s, r in sorted(found.items())]
         derived["activations"] = [distortion.activations(t) for t in traces]

@@ -1,0 +1,1 @@
+"""Adapters: the filter in other people's training."""

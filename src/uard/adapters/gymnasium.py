@@ -1,0 +1,221 @@
+"""The filter as a Gymnasium wrapper.
+
+    >>> import gymnasium, uard.envs
+    >>> from uard.adapters.gymnasium import ReliabilityWrapper
+    >>> env = ReliabilityWrapper(gymnasium.make("uard/TrapGrid6-v0", panel="main"))
+    >>> observation, info = env.reset(seed=0)
+    >>> observation, reward, terminated, truncated, info = env.step(3)
+    >>> sorted(set(info) & {"raw_reward", "weight", "sigma_h"})
+    ['raw_reward', 'sigma_h', 'weight']
+
+Order matters (stable-baselines3#146): what wraps this wrapper sees filtered rewards, what it wraps sees raw ones. So a
+``RecordEpisodeStatistics`` or ``Monitor`` outside logs what the agent learns from; both returns of an episode are in
+the ``info`` of its last step (``raw_return``, ``filtered_return``); ``Monitor(info_keywords=...)`` writes them down.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from uard.abstention import Abstention
+from uard.adapters.steps import INFO, Doubt, Key, Ratings, Steps, natural_key, rows_of, subset
+from uard.mitigation import Mitigation
+from uard.stream import RewardStream
+
+
+def _steps(
+    env: Any,
+    mitigation: Mitigation | None,
+    ratings: Ratings | None,
+    sigma_m: Doubt | None,
+    key: Key | None,
+    abstention: Abstention | None,
+    single: str,
+) -> Steps:
+    spaces = getattr(env, f"{single}observation_space"), getattr(env, f"{single}action_space")
+    return Steps(RewardStream(mitigation, abstention=abstention), ratings, sigma_m, key or natural_key(*spaces))
+
+
+class ReliabilityWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+    """Emits filtered rewards; wraps single and vector environments (for those it is ``VectorReliabilityWrapper``).
+
+    After each step ``info`` also holds ``raw_reward``, ``weight`` w, ``sigma_m``, ``sigma_h``, ``lambda_t`` and
+    ``abstained``; after an episode's last step ``raw_return`` and ``filtered_return``.
+
+    Attributes:
+        steps: What filters; its ``stream`` is all that is remembered.
+    """
+
+    def __new__(cls, env: Any = None, *args: Any, **options: Any) -> Any:  # unpickling gives none
+        """Return the vector form for vector environments."""
+        if isinstance(env, gymnasium.vector.VectorEnv):
+            return VectorReliabilityWrapper(env, *args, **options)
+        return super().__new__(cls)
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        mitigation: Mitigation | None = None,
+        *,
+        ratings: Ratings | None = None,
+        sigma_m: Doubt | None = None,
+        key: Key | None = None,
+        abstention: Abstention | None = None,
+    ):
+        """Wrap an environment.
+
+        Args:
+            env: Its ``info["ratings"]``, K numbers with None or NaN where one is missing, are taken where there is
+                no ``ratings``; a step without is a step that nobody rated.
+            mitigation: What to do with rewards; ``uard()`` if left out.
+            ratings: Called with batches (observations, actions, next observations, rewards), B = 1 here.
+            sigma_m: Called with batches (observations, actions); e.g. ``uard.ensemble.RewardEnsemble``.
+            key: Tells state-actions apart, so that what was said of one is remembered when it comes again; found for
+                numbered states and actions if left out.
+            abstention: Marks steps in ``info["abstained"]``.
+        """
+        gymnasium.utils.RecordConstructorArgs.__init__(
+            self, mitigation=mitigation, ratings=ratings, sigma_m=sigma_m, key=key, abstention=abstention
+        )
+        super().__init__(env)
+        self.steps = _steps(env, mitigation, ratings, sigma_m, key, abstention, "")
+        self._observation: Any = None
+        self._returns = np.zeros(2)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; what was learned of the raters is kept."""
+        self._observation, info = super().reset(seed=seed, options=options)
+        self._returns[:] = 0.0
+        return self._observation, info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Take one step and return it with the filtered reward.
+
+        Raises:
+            InvalidValueError: for a reward or ratings that no training should be fed.
+        """
+        following, reward, terminated, truncated, info = super().step(action)
+        found = info.get("ratings")
+        out = self.steps.filter(
+            _batch(self._observation),
+            _batch(action),
+            _batch(following),
+            np.array([reward], float),
+            None if found is None else rows_of({0: found}, 1),
+        )
+        filtered = float(out.reward[0])
+        self._observation = following
+        self._returns += float(out.raw[0]), filtered
+        info = info | {name: getattr(out, where)[0].item() for name, where in INFO.items()}
+        if terminated or truncated:
+            info |= {"raw_return": float(self._returns[0]), "filtered_return": float(self._returns[1])}
+        return following, filtered, terminated, truncated, info
+
+
+class VectorReliabilityWrapper(gymnasium.vector.VectorWrapper, gymnasium.utils.RecordConstructorArgs):
+    """The same for vector environments in all three autoreset modes; ``info`` holds arrays with their masks ``_name``.
+
+    The step that only resets (``AutoresetMode.NEXT_STEP``) is neither filtered nor remembered.
+
+    Attributes:
+        steps: What filters; one for all environments.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.vector.VectorEnv[Any, Any, Any],
+        mitigation: Mitigation | None = None,
+        *,
+        ratings: Ratings | None = None,
+        sigma_m: Doubt | None = None,
+        key: Key | None = None,
+        abstention: Abstention | None = None,
+    ):
+        """Wrap vector environments; see ``ReliabilityWrapper``."""
+        gymnasium.utils.RecordConstructorArgs.__init__(
+            self, mitigation=mitigation, ratings=ratings, sigma_m=sigma_m, key=key, abstention=abstention
+        )
+        super().__init__(env)
+        self.steps = _steps(env, mitigation, ratings, sigma_m, key, abstention, "single_")
+        self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+        self._observation: Any = None
+        self._returns = np.zeros((2, self.num_envs))
+        self._resetting = np.zeros(self.num_envs, bool)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start episodes (those of ``options["reset_mask"]``, if given); what was learned of the raters is kept."""
+        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)), bool).copy()
+        self._observation, info = super().reset(seed=seed, options=options)
+        self._returns[:, mask] = 0.0
+        self._resetting[mask] = False
+        return self._observation, info
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Take one step in every environment and return it with filtered rewards.
+
+        Raises:
+            InvalidValueError: for a reward or ratings that no training should be fed; names the environment.
+        """
+        n = self.num_envs
+        following, rewards, terminated, truncated, info = super().step(actions)
+        info, ended = dict(info), np.asarray(terminated) | np.asarray(truncated)
+        reached = self._reached(following, ended, info)
+        found = rows_of(_reported(info, ended if self._mode is AutoresetMode.SAME_STEP else np.zeros(n, bool)), n)
+        real = np.flatnonzero(~self._resetting)
+        filtered = np.array(rewards, float)
+        if len(real):
+            out = self.steps.filter(
+                subset(self._observation, real),
+                subset(actions, real),
+                subset(reached, real),
+                filtered[real],
+                None if found is None else found[real],
+            )
+            self._returns[0, real] += filtered[real]
+            filtered[real] = out.reward
+            self._returns[1, real] += out.reward
+            for name, where in INFO.items():
+                _put(info, name, real, getattr(out, where), n)
+        over = np.flatnonzero(ended & ~self._resetting)
+        if len(over):
+            for name, returns in zip(("raw_return", "filtered_return"), self._returns, strict=True):
+                _put(info, name, over, returns[over], n)
+            self._returns[:, over] = 0.0
+        self._resetting = ended if self._mode is AutoresetMode.NEXT_STEP else np.zeros(n, bool)
+        self._observation = following
+        return following, filtered, terminated, truncated, info
+
+    def _reached(self, following: Any, ended: np.ndarray, info: dict[str, Any]) -> Any:
+        """Return what the steps led to, before any reset."""
+        if self._mode is not AutoresetMode.SAME_STEP or not ended.any() or self.steps.ratings is None:
+            return following
+        rows = [info["final_obs"][i] if ended[i] else subset(following, np.array(i)) for i in range(self.num_envs)]
+        space = self.single_observation_space
+        out = gymnasium.vector.utils.create_empty_array(space, self.num_envs)
+        return gymnasium.vector.utils.concatenate(space, rows, out)
+
+
+def _reported(info: dict[str, Any], ended: np.ndarray) -> dict[int, Any]:
+    """Return the ratings of those environments that reported any; those that just ended did so in ``final_info``."""
+    found: dict[int, Any] = {}
+    for source, mine in ((info, ~ended), (info.get("final_info", {}), ended)):
+        if "ratings" in source:
+            there = np.asarray(source.get("_ratings", np.ones(len(ended), bool))) & mine
+            found |= {int(i): source["ratings"][i] for i in np.flatnonzero(there)}
+    return found
+
+
+def _put(info: dict[str, Any], name: str, places: np.ndarray, values: np.ndarray, count: int) -> None:
+    whole, mask = np.zeros(count, values.dtype), np.zeros(count, bool)
+    whole[places], mask[places] = values, True
+    info[name], info[f"_{name}"] = whole, mask
+
+
+def _batch(one: Any) -> Any:
+    if isinstance(one, dict):
+        return {name: _batch(part) for name, part in one.items()}
+    return tuple(_batch(part) for part in one) if isinstance(one, tuple) else np.asarray(one)[None]

@@ -1,0 +1,310 @@
+"""The filter in Stable-Baselines3: a wrapper for its environments, a replay buffer, a callback that reports.
+
+On-policy (PPO, A2C, sb3-contrib's TRPO): wrap the environments, before any ``VecNormalize``::
+
+    env = VecNormalize(ReliabilityVecEnv(make_vec_env(...)))
+    PPO("MlpPolicy", env).learn(100_000, callback=ReliabilityCallback())
+
+Off-policy (DQN, SAC, TD3): let the replay buffer filter when it is sampled, so that old steps are judged by what is
+known now, and by the critics as they are now::
+
+    DQN("MlpPolicy", env, replay_buffer_class=ReliabilityReplayBuffer).learn(100_000, callback=ReliabilityCallback())
+
+Ratings come from ``info["ratings"]`` or from a callable. ``rollout/ep_rew_mean`` is what the Monitor saw: the raw
+return where it is inside ``ReliabilityVecEnv``, as ``make_vec_env`` has it. The callback logs ``uard/raw_return`` and
+``uard/filtered_return`` beside each other.
+"""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uard import _checks
+from uard.abstention import Abstention
+from uard.adapters.steps import INFO, Doubt, Key, Ratings, Steps, natural_key, rows_of
+from uard.mitigation import Mitigation
+from uard.stream import Filtered, RewardStream
+
+try:
+    from stable_baselines3.common.buffers import ReplayBuffer
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        f"uard.adapters.sb3 needs Stable-Baselines3: pip install 'uard[sb3]' ({error})", name=error.name
+    ) from error
+
+
+class ReliabilityVecEnv(VecEnvWrapper):
+    """Emits filtered rewards; ``infos[i]`` also holds what ``uard.adapters.gymnasium.ReliabilityWrapper`` puts there.
+
+    Attributes:
+        steps: What filters; one for all environments.
+    """
+
+    def __init__(
+        self,
+        venv: VecEnv,
+        mitigation: Mitigation | None = None,
+        *,
+        ratings: Ratings | None = None,
+        sigma_m: Doubt | None = None,
+        key: Key | None = None,
+        abstention: Abstention | None = None,
+    ):
+        """Wrap environments; the arguments are those of ``uard.adapters.gymnasium.ReliabilityWrapper``.
+
+        Raises:
+            InvalidValueError: if rewards arrive normalised: ``VecNormalize`` goes outside.
+        """
+        _refuse_normalised(venv)
+        super().__init__(venv)
+        key = key or natural_key(venv.observation_space, venv.action_space)
+        self.steps = Steps(RewardStream(mitigation, abstention=abstention), ratings, sigma_m, key)
+        self._observation: Any = None
+        self._actions: Any = None
+        self._returns = np.zeros((2, venv.num_envs))
+
+    def reset(self) -> Any:
+        """Start all episodes; what was learned of the raters is kept."""
+        self._observation = self.venv.reset()
+        self._returns[:] = 0.0
+        return self._observation
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Send the actions."""
+        self._actions = actions
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> Any:
+        """Return observations, filtered rewards, dones and infos.
+
+        Raises:
+            InvalidValueError: for a reward or ratings that no training should be fed; names the environment.
+        """
+        following, rewards, dones, infos = self.venv.step_wait()
+        reached = following if self.steps.ratings is None else _reached(following, dones, infos)
+        found = rows_of({i: x["ratings"] for i, x in enumerate(infos) if x.get("ratings") is not None}, len(infos))
+        out = self.steps.filter(self._observation, self._actions, reached, np.asarray(rewards, float), found)
+        self._returns += np.stack([out.raw, out.reward])
+        columns = {name: getattr(out, where).tolist() for name, where in INFO.items()}
+        for i, info in enumerate(infos):
+            for name, values in columns.items():
+                info[name] = values[i]
+            if dones[i]:
+                info["raw_return"], info["filtered_return"] = self._returns[:, i].tolist()
+                self._returns[:, i] = 0.0
+        self._observation = following
+        return following, out.reward.astype(np.float32), dones, infos
+
+    def save(self, path: str | Path) -> None:
+        """Write what was learned of rewards and raters to a file."""
+        with Path(path).open("wb") as file:
+            pickle.dump(self.steps.stream, file)
+
+    @classmethod
+    def load(cls, path: str | Path, venv: VecEnv, **sources: Any) -> ReliabilityVecEnv:
+        """Wrap environments with what ``save`` wrote; ``sources`` are ``ratings``, ``sigma_m`` and ``key``."""
+        with Path(path).open("rb") as file:
+            stream = pickle.load(file)
+        if not isinstance(stream, RewardStream):
+            raise _checks.InvalidValueError("path", str(path), "a file that ReliabilityVecEnv.save wrote")
+        env = cls(venv, stream.mitigation, **sources)
+        env.steps.stream = stream
+        return env
+
+
+def _refuse_normalised(venv: Any) -> None:
+    while isinstance(venv, VecEnvWrapper):
+        if isinstance(venv, VecNormalize) and venv.norm_reward:
+            allowed = "VecNormalize(ReliabilityVecEnv(venv)): raters do not speak in normalised rewards"
+            raise _checks.InvalidValueError("venv", type(venv).__name__, allowed)
+        venv = venv.venv
+
+
+def _reached(following: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> Any:
+    """Return what the steps led to, before any reset."""
+    if not dones.any():
+        return following
+    if isinstance(following, dict):
+        part = [
+            {"terminal_observation": i["terminal_observation"]} if "terminal_observation" in i else {} for i in infos
+        ]
+        return {
+            name: _reached(x, dones, [{k: v[name] for k, v in i.items()} for i in part])
+            for name, x in following.items()
+        }
+    reached = np.array(following)
+    for i in np.flatnonzero(dones):
+        reached[i] = infos[i]["terminal_observation"]
+    return reached
+
+
+class ReliabilityReplayBuffer(ReplayBuffer):
+    """Keeps raw rewards and what was said of them, and filters whenever it is sampled.
+
+    For ``replay_buffer_class=`` of DQN, SAC, TD3 and DDPG with one-step targets and observations that are arrays; the
+    options go into ``replay_buffer_kwargs``. ``save_replay_buffer`` keeps all of it.
+
+    Attributes:
+        steps: What filters.
+        latest: The rewards that were sampled last.
+    """
+
+    def __init__(
+        self,
+        *arguments: Any,
+        mitigation: Mitigation | None = None,
+        ratings: Ratings | None = None,
+        sigma_m: Doubt | None = None,
+        key: Key | None = None,
+        **options: Any,
+    ):
+        """Build an empty buffer; see ``ReplayBuffer`` and ``uard.adapters.gymnasium.ReliabilityWrapper``."""
+        super().__init__(*arguments, **options)
+        key = key or natural_key(self.observation_space, self.action_space)
+        self.steps = Steps(RewardStream(mitigation), ratings, sigma_m, key)
+        self.latest: Filtered | None = None
+        size = self.buffer_size, self.n_envs
+        self._raw = np.zeros(size)
+        # With keys the place of what is known of a step, without what was said of it.
+        self._slots = np.zeros(size if key else (0, 0), np.int64)
+        self._said = np.zeros((0, 0, 5) if key else (*size, 5))
+
+    def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:
+        """Store one step of every environment, with the ratings in its ``info``.
+
+        Raises:
+            InvalidValueError: for a reward or ratings that no training should be fed; names the environment.
+        """
+        place = self.pos
+        rewards = np.asarray(reward, float).reshape(-1)
+        found = rows_of({i: x["ratings"] for i, x in enumerate(infos) if x.get("ratings") is not None}, self.n_envs)
+        obs, action = np.asarray(obs), np.asarray(action)
+        states, acts = obs.reshape(self.n_envs, *self.obs_shape), action.reshape(self.n_envs, self.action_dim)
+        if self.steps.key is not None:
+            states, acts = _numbered(states), _numbered(acts)
+        said = self.steps.said(states, acts, next_obs, rewards, found)
+        slots, own = self.steps.stream.hear(rewards, said, self.steps.keys(states, acts, self.n_envs))
+        super().add(obs, next_obs, action, reward, done, infos)
+        self._raw[place] = rewards
+        if slots is None:
+            self._said[place] = own
+        else:
+            self._slots[place] = slots
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Any:
+        raw = self._raw[batch_inds].reshape(-1)
+        if self.steps.key is None:
+            rows = self._said[batch_inds].reshape(-1, 5)
+        else:
+            rows = self.steps.stream.rows(self._slots[batch_inds].reshape(-1))
+        doubt = None
+        if self.steps.sigma_m is not None:
+            states = self._normalize_obs(self.observations[batch_inds].reshape(-1, *self.obs_shape), env)
+            doubt = self.steps.sigma_m(states, self.actions[batch_inds].reshape(-1, self.action_dim))
+        self.latest = self.steps.stream.filter(raw, rows, doubt)
+        self.rewards[batch_inds] = self.latest.reward.reshape(-1, self.n_envs)
+        return super()._get_samples(batch_inds, env)
+
+
+def _numbered(column: np.ndarray) -> np.ndarray:
+    return column.reshape(len(column), -1)[:, 0] if column.ndim > 1 else column
+
+
+class CriticDisagreement:
+    """sigma_m from the critics of an algorithm that has several (SAC, TD3, TQC): deviation of their values.
+
+    In units of value, as in the paper (A12).
+    """
+
+    def __init__(self, model: Any):
+        """Read the critics of a model.
+
+        Raises:
+            InvalidValueError: if it has fewer than two.
+        """
+        if critics_of(model) < 2:
+            allowed = "one with two critics or more (SAC, TD3; policy_kwargs=dict(n_critics=5))"
+            raise _checks.InvalidValueError("model", type(model).__name__, allowed)
+        self._model = model
+
+    def __call__(self, observations: Any, actions: Any) -> np.ndarray:
+        """Return sigma_m (B,) of state-actions as the critics take them: states normalised, actions in [-1, 1]."""
+        import torch
+
+        with torch.no_grad():
+            policy = self._model.policy
+            states, _ = policy.obs_to_tensor(observations)
+            acts = torch.as_tensor(np.asarray(actions), device=policy.device, dtype=torch.float32)
+            values = torch.cat(self._model.critic(states, acts), 1)
+        return values.std(1, correction=1).double().cpu().numpy()
+
+    def outside(self, observations: Any, actions: Any) -> np.ndarray:
+        """Return sigma_m (B,) of state-actions as the environments have them."""
+        normalised = self._model.get_vec_normalize_env()
+        states = observations if normalised is None else normalised.normalize_obs(observations)
+        return self(states, self._model.policy.scale_action(actions))
+
+
+def critics_of(model: Any) -> int:
+    """Return how many critics a model of Stable-Baselines3 has that rate a state with an action."""
+    return len(getattr(getattr(model, "critic", None), "q_networks", ()))
+
+
+class ReliabilityCallback(BaseCallback):
+    """Logs what the filter does under ``uard/``, and lends it the algorithm's critics where it has several.
+
+    Scalars (means since the last dump): ``weight``, ``sigma_m``, ``sigma_h``, ``lambda_t``, ``abstained``, ``reward``
+    and ``raw_reward``; with ``ReliabilityVecEnv`` also ``raw_return`` and ``filtered_return`` per episode.
+    """
+
+    def __init__(self, critics: bool = True, verbose: int = 0):
+        """Choose whether sigma_m comes from the critics where nothing else was given."""
+        super().__init__(verbose)
+        self._critics = critics
+        self._lent: list[Steps] = []
+        self._buffer: ReliabilityReplayBuffer | None = None
+
+    def _on_training_start(self) -> None:
+        buffer = getattr(self.model, "replay_buffer", None)
+        self._buffer = buffer if isinstance(buffer, ReliabilityReplayBuffer) else None
+        env: Any = self.training_env
+        while isinstance(env, VecEnvWrapper) and not isinstance(env, ReliabilityVecEnv):
+            env = env.venv
+        wrapped = env if isinstance(env, ReliabilityVecEnv) else None
+        if self._buffer is None and wrapped is None:
+            raise _checks.InvalidValueError(
+                "env", type(self.training_env).__name__, "a ReliabilityVecEnv, or give the ReliabilityReplayBuffer"
+            )
+        if self._buffer is not None and wrapped is not None:
+            raise _checks.InvalidValueError(
+                "env", "ReliabilityVecEnv", "left out where the replay buffer filters: rewards would be filtered twice"
+            )
+        steps = (self._buffer or wrapped).steps  # type: ignore[union-attr]
+        if self._critics and steps.sigma_m is None and critics_of(self.model) >= 2:
+            critics = CriticDisagreement(self.model)
+            steps.sigma_m = critics.outside if self._buffer is None else critics
+            self._lent.append(steps)
+
+    def _on_step(self) -> bool:
+        if self._buffer is not None:
+            if self._buffer.latest is not None:
+                for name, where in (("reward", "reward"), *INFO.items()):
+                    self.logger.record_mean(f"uard/{name}", float(getattr(self._buffer.latest, where).mean()))
+                self._buffer.latest = None
+            return True
+        for info in self.locals["infos"]:
+            for name in (*INFO, "raw_return", "filtered_return"):
+                if name in info:
+                    self.logger.record_mean(f"uard/{name}", float(info[name]))
+        return True
+
+    def _on_training_end(self) -> None:
+        for steps in self._lent:  # or a saved buffer would hold the model
+            steps.sigma_m = None
+        self._lent.clear()

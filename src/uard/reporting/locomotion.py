@@ -1,0 +1,179 @@
+"""Tables, a figure and findings of Hopper and Walker2d (G6, G7, G10, G11; H4, H11, H12), from the published results."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from uard import statistics
+from uard.lab.study import Row
+from uard.reporting import figures
+from uard.reporting.published import Published
+from uard.reporting.tables import Table, full
+
+HACKING, NOISE, KICK = "mujoco-standard-hacking", "mujoco-standard-noise", "mujoco-standard-kick"
+REMOVED, KEPT, COST = 0.936, 0.9, 0.05  # the paper's best reduction (J16); what is asked of a filter beside it
+METRICS = ("trap_visits", "true_return", "observed_return")
+COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", "uard": "#2c6fbb"}
+
+
+def tables(p: Published) -> list[Table]:
+    """Return all tables for which there are results."""
+    return [t for t in (_hacking(p), _noise(p), _kick(p)) if t.rows]
+
+
+def _steps(p: Published, study: str) -> str:
+    return f"{p.rows(study)[0].cell.steps:,} steps, {p.seeds(study)} seeds" if p.rows(study) else ""
+
+
+def _hacking(p: Published) -> Table:
+    rows = []
+    for r in p.rows(HACKING):
+        cells = (full(p.of(r, m)) for m in METRICS)
+        share = _shares(p, r)
+        where = f"{r['robot']}, {r['region']}" if r["region"] != "none" else f"{r['robot']}, no lie"
+        best = (full(statistics.summarise(x)) for x in p.derived(r, "deterministic").T)
+        rows.append((where, r["agent"], r["mitigation"], r["panel"], *cells, *share, *best))
+    return Table(
+        f"Hopper and Walker2d with a reward that lies (G6, G7), {_steps(p, HACKING)}, 15 % of steps rated",
+        (
+            "task", "agent", "learns from", "panel", "steps in the region per episode", "true return",
+            "observed return", "hacks removed", "true return kept", "deterministic: steps in the region", "true return",
+        ),
+        tuple(rows),
+        4,
+        "Over the last 100 training episodes, actions as the policy draws them; the two deterministic columns are eight "
+        "more episodes of each trained agent with its most likely actions. Removed: of the raw agent's hacks. Kept: of "
+        "the true return of the same agent trained on the true reward (without a lie: of the raw agent's). The paper's "
+        "thresholds of 42 and 110 are falls after 39 to 49 and about 113 steps; doing nothing scores 141 and 95.",
+    )  # fmt: skip
+
+
+def _rival(p: Published, r: Row, mitigation: str) -> Row | None:
+    found = p.rows(HACKING, robot=r["robot"], region=r["region"], agent=r["agent"], mitigation=mitigation)
+    return found[0] if found else None
+
+
+def shares(p: Published, r: Row) -> tuple[float | None, float | None]:
+    """Return what a row removes of the raw agent's hacks, and keeps of the honest agent's true return.
+
+    Where the raw agent makes less than one hack step per episode a share of it says nothing and is None.
+    """
+    raw = _rival(p, r, "raw")
+    honest = _rival(p, r, "raw" if r["region"] == "none" else "true reward")
+    removed = kept = None
+    if raw is not None and p.of(raw, "trap_visits").mean >= 1.0:
+        removed = 1.0 - p.of(r, "trap_visits").mean / p.of(raw, "trap_visits").mean
+    if honest is not None and p.of(honest, "true_return").mean > 0:
+        kept = p.of(r, "true_return").mean / p.of(honest, "true_return").mean
+    return removed, kept
+
+
+def _shares(p: Published, r: Row) -> tuple[str, str]:
+    if r["mitigation"] in ("raw", "true reward"):
+        return "–", "–"
+    removed, kept = ("–" if x is None else f"{100 * x:.1f} %" for x in shares(p, r))
+    return removed, kept
+
+
+def _noise(p: Published) -> Table:
+    rows = [
+        (r["agent"], r["mitigation"], f"{100 * r['noise']:.0f} %", *(full(p.of(r, m)) for m in METRICS))
+        for r in p.rows(NOISE)
+    ]
+    return Table(
+        f"Violations against noise (G11): Hopper, vibration, main panel, {_steps(p, NOISE)}",
+        ("agent", "learns from", "noise", "steps in the region per episode", "true return", "observed return"),
+        tuple(rows),
+        3,
+        "Noise on every rating, as a share of the bonus. The raw agent does not listen, so noise cannot reach it.",
+    )
+
+
+def _kick(p: Published) -> Table:
+    rows = [
+        (r["mitigation"], r["kicked"], *(full(p.of(r, m)) for m in (*METRICS, "episode_length"))) for r in p.rows(KICK)
+    ]
+    return Table(
+        f"A state thrown off by +5 at step 500 (G10): Hopper, vibration, PPO, {_steps(p, KICK)}",
+        (
+            "learns from", "kicked", "steps in the region per episode", "true return", "observed return",
+            "episode length",
+        ),
+        tuple(rows),
+        2,
+        "An episode that ends before step 500 was never kicked.",
+    )  # fmt: skip
+
+
+def losses(p: Published) -> list[str]:
+    """Say where ``uard`` misses what is asked of it in MuJoCo, found by rule."""
+    ours = [r for r in p.rows(HACKING, mitigation="uard")]
+    if not ours:
+        return []
+    out = []
+    lies = [(r, *shares(p, r)) for r in ours if r["region"] != "none"]
+    leaks = [f"{_name(r)} {100 * x:.1f} %" for r, x, _ in lies if x is not None and x < REMOVED]
+    poor = [f"{_name(r)} {100 * x:.0f} %" for r, _, x in lies if x is not None and x < KEPT]
+    judged = sum(x is not None for _, x, _ in lies)
+    out.append(
+        f"MuJoCo, {_steps(p, HACKING)}: of {judged} settings in which the raw agent hacks, uard removes less than "
+        f"93.6 % of its hacks in {len(leaks)}{_listed(leaks)}; of {len(lies)} settings it keeps less than 90 % of the true "
+        f"return of the agent trained on the true reward in {len(poor)}{_listed(poor)}. "
+        f"With {p.seeds(HACKING)} seeds these shares are rough: see the intervals."
+    )
+    plain = [(r, shares(p, r)[1]) for r in ours if r["region"] == "none"]
+    dear = [f"{_name(r)} {100 * (1 - x):.0f} %" for r, x in plain if x is not None and x < 1 - COST]
+    if plain:
+        out.append(
+            f"MuJoCo without a lie: uard costs more than 5 % of the true return in {len(dear)} of {len(plain)} "
+            f"settings{_listed(dear)}."
+        )
+    return out
+
+
+def _listed(names: list[str]) -> str:
+    return f" ({'; '.join(names)})" if names else ""
+
+
+def _name(r: Row) -> str:
+    return f"{r['robot']} {r['region']} {r['agent']} {r['panel']}"
+
+
+def drawn(p: Published) -> list[tuple[str, str, str]]:
+    """Return (title, what to see, image) of the figure, if there are results."""
+    settings = list(
+        dict.fromkeys((r["robot"], r["region"], r["agent"]) for r in p.rows(HACKING) if r["region"] != "none")
+    )
+    if not settings:
+        return []
+    note = "One dot per seed, a bar at the mean. A mitigation works if hacks fall and the true return does not."
+    return [
+        ("G6, G7 · steps in the region that lies, and what they were worth", note, figures.data_uri(_dots(p, settings)))
+    ]
+
+
+def _dots(p: Published, settings: list[Any]) -> Figure:
+    figure, axes = figures._axes(2, 6.2, 1.2 + 0.9 * len(settings))
+    for axis, metric, label in zip(
+        axes, ("trap_visits", "true_return"), ("steps in the region per episode", "true return"), strict=True
+    ):
+        names = []
+        for i, (robot, region, agent) in enumerate(settings):
+            names.append(f"{robot}\n{region}, {agent}")
+            rows = p.rows(HACKING, robot=robot, region=region, agent=agent)
+            for j, r in enumerate(rows):
+                values, y = p.per_seed(r, metric), i + 0.8 * ((j + 0.5) / len(rows) - 0.5)
+                hollow = r["panel"] == "appendix"
+                colour = COLOURS[r["mitigation"]]
+                axis.plot(values, np.full(len(values), y), "o", ms=4, color=colour, mfc="none" if hollow else colour)
+                axis.plot([values.mean()] * 2, [y - 0.05, y + 0.05], color=colour, lw=2)
+        axis.set(xlabel=label, yticks=range(len(names)), yticklabels=names)
+        axis.invert_yaxis()
+    for name, colour in COLOURS.items():
+        axes[0].plot([], [], "o", color=colour, label=name)
+    axes[0].plot([], [], "o", color="#777777", mfc="none", label="appendix panel")
+    axes[0].legend(fontsize=8, loc="center right")
+    return figure

@@ -1,0 +1,278 @@
+import copy
+import pickle
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import RecordEpisodeStatistics
+
+import uard.envs  # noqa: F401 registers the ids
+from uard import InvalidValueError
+from uard.abstention import Abstention
+from uard.adapters.gymnasium import ReliabilityWrapper, VectorReliabilityWrapper
+from uard.adapters.steps import INFO
+from uard.ensemble import RewardEnsemble
+from uard.mitigation import RatedReward, Raw
+
+GRID = "uard/TrapGrid6-v0"
+
+
+class Says(gymnasium.Env):
+    """Pays 1, 2, 3 ... and says of each step what it was told to; ends after ``length`` steps."""
+
+    observation_space = gymnasium.spaces.Discrete(100)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, ratings, length=3, rewards=None):
+        self.ratings, self.length, self.rewards = ratings, length, rewards
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return 0, {}
+
+    def step(self, action):
+        self.time += 1
+        reward = self.time if self.rewards is None else self.rewards[self.time - 1]
+        said = self.ratings(self.time) if callable(self.ratings) else self.ratings
+        info = {} if said is None else {"ratings": said}
+        return self.time, float(reward), self.time >= self.length, False, info
+
+
+def walk(env, steps, seed=0):
+    """Take random steps, and return rewards and infos."""
+    env.action_space.seed(seed)
+    env.reset(seed=seed)
+    out = []
+    for _ in range(steps):
+        _, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        out.append((reward, info))
+        if terminated or truncated:
+            env.reset()
+    return out
+
+
+def test_a_trap_pays_no_longer_and_info_says_why():
+    env = ReliabilityWrapper(gymnasium.make(GRID, panel="main"))
+    steps = walk(env, 3000)[1500:]
+    traps = [(r, i) for r, i in steps if i["evaluation"].hack]
+    honest = [(r, i) for r, i in steps if not i["evaluation"].hack and i["raw_reward"] < 0]
+    assert len(traps) > 20
+    assert max(r for r, _ in traps) < -0.5
+    assert np.mean([r for r, _ in honest]) == pytest.approx(-0.1, abs=0.05)
+    assert set(INFO) <= set(traps[0][1])
+    assert all(i["raw_reward"] == 4.0 and i["sigma_h"] > 1 and i["weight"] < 0.1 for _, i in traps)
+    assert traps[0][1]["lambda_t"] > honest[-1][1]["lambda_t"]
+
+
+def test_both_returns_of_an_episode_are_logged_whichever_wrapper_counts():
+    inside = RecordEpisodeStatistics(gymnasium.make(GRID, panel="main"), stats_key="raw")
+    env = RecordEpisodeStatistics(ReliabilityWrapper(inside))
+    ends = [i for _, i in walk(env, 400) if "episode" in i]
+    assert len(ends) == 10
+    for info in ends:
+        assert info["raw"]["r"] == pytest.approx(info["raw_return"])
+        assert info["episode"]["r"] == pytest.approx(info["filtered_return"])
+    assert any(abs(i["raw_return"] - i["filtered_return"]) > 1 for i in ends)
+
+
+def test_ratings_and_sigma_from_callables_and_the_built_in_ensemble():
+    env = gymnasium.make(GRID)
+    asked = []
+
+    def ratings(observations, actions, following, rewards):
+        asked.append((observations.shape, actions.shape, following.shape, rewards.shape))
+        return np.stack([rewards, rewards + 1.0], 1)
+
+    ensemble = RewardEnsemble(env.observation_space, env.action_space)
+    env = ReliabilityWrapper(env, ratings=ratings, sigma_m=ensemble)
+    steps = walk(env, 1500)
+    assert set(asked) == {((1,), (1,), (1,), (1,))}
+    early, late = (np.mean([i["sigma_m"] for _, i in part]) for part in (steps[:20], steps[-20:]))
+    assert late < 0.5 * early
+    assert steps[0][1]["sigma_h"] > 0
+
+
+def test_a_key_tells_state_actions_apart_where_numbers_do_not():
+    env = ReliabilityWrapper(Says([0.0, 2.0]), RatedReward("mean"), key=lambda observation, action: "all the same")
+    assert [r for r, _ in walk(env, 3)] == [1.0, 1.0, 1.0]
+    assert env.steps.stream.rows(np.array([0]))[0, 0] == 3
+
+
+def test_steps_that_nobody_rates():
+    env = ReliabilityWrapper(Says(lambda time: [0.0, 2.0] if time == 2 else None), key=lambda o, a: int(o))
+    weights = [i["weight"] for _, i in walk(env, 3)]
+    assert weights[0] <= 0.1
+    assert weights[1] > weights[0]
+
+
+def test_a_rater_who_is_missing_is_no_zero():
+    env = ReliabilityWrapper(Says([None, 4.0, float("nan"), 8.0]), RatedReward("mean"))
+    assert [r for r, _ in walk(env, 3)] == [6.0, 6.0, 6.0]
+
+
+def test_abstention_is_marked():
+    env = ReliabilityWrapper(Says([-5.0, 5.0]), abstention=Abstention("threshold", 0.5))
+    assert [i["abstained"] for _, i in walk(env, 3)] == [True, True, True]
+
+
+def test_dict_observations_reach_the_callables_in_batches():
+    class Two(Says):
+        observation_space = gymnasium.spaces.Dict({"a": gymnasium.spaces.Box(-9, 9, (2,)), "b": FOUR})
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return {"a": np.zeros(2, np.float32), "b": 1}, {}
+
+        def step(self, action):
+            _, *rest = super().step(action)
+            return {"a": np.ones(2, np.float32), "b": 2}, *rest
+
+    seen = []
+
+    def ratings(observations, actions, following, rewards):
+        seen.append((observations["a"].shape, observations["b"].shape, following["b"].item()))
+        return rewards[:, None] + np.array([[0.0, 1.0]])
+
+    walk(ReliabilityWrapper(Two(None), ratings=ratings), 2)
+    assert seen == [((1, 2), (1,), 2)] * 2
+
+
+FOUR = gymnasium.spaces.Discrete(4)
+
+
+def test_spec_pickling_and_copying_keep_what_was_learned():
+    env = ReliabilityWrapper(gymnasium.make(GRID, panel="main"))
+    walk(env, 200)
+    assert env.spec.additional_wrappers[-1].name == "ReliabilityWrapper"
+    for twin in (pickle.loads(pickle.dumps(env)), copy.deepcopy(env)):
+        assert twin.steps.stream.seen == env.steps.stream.seen
+        mine, other = env.steps.stream.rows(np.arange(5)), twin.steps.stream.rows(np.arange(5))
+        assert np.array_equal(mine, other)
+    assert ReliabilityWrapper(gymnasium.make(GRID), Raw()).spec.make().unwrapped.grid.size == 6
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+@pytest.mark.parametrize("count", [1, 3])
+def test_vectors_filter_as_single_environments_do_in_every_autoreset_mode(mode, count):
+    """One environment's rewards, in order, do not depend on the mode; reset steps are left alone."""
+    lengths = [3, 4, 5][:count]
+    vector = SyncVectorEnv([lambda n=n: Says([0.0, 2.0], n) for n in lengths], autoreset_mode=mode)
+    env = ReliabilityWrapper(vector, RatedReward("mean"), key=lambda o, a: int(o))
+    assert isinstance(env, VectorReliabilityWrapper)
+    env.reset(seed=0)
+    got = [[] for _ in lengths]
+    ends = [[] for _ in lengths]
+    for _ in range(14):
+        _, rewards, terminated, _, info = env.step(np.zeros(count, int))
+        for i in range(count):
+            if info.get("_weight", np.zeros(count, bool))[i]:
+                got[i].append((info["raw_reward"][i], rewards[i]))
+            else:
+                assert mode is AutoresetMode.NEXT_STEP
+                assert rewards[i] == 0.0
+            if info.get("_raw_return", np.zeros(count, bool))[i]:
+                ends[i].append((info["raw_return"][i], info["filtered_return"][i]))
+        if mode is AutoresetMode.DISABLED and terminated.any():
+            env.reset(options={"reset_mask": terminated})
+    for n, steps, returns in zip(lengths, got, ends, strict=True):
+        assert [raw for raw, _ in steps] == [float(1 + k % n) for k in range(len(steps))]
+        assert {filtered for _, filtered in steps} == {1.0}  # the mean of 0 and 2
+        assert len(steps) >= 14 - 14 // n
+        assert returns == [(n * (n + 1) / 2, float(n))] * (len(steps) // n)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_callables_of_a_vector_see_where_the_episode_ended_not_where_the_next_began(mode):
+    seen = []
+
+    def ratings(observations, actions, following, rewards):
+        seen.extend(zip(observations.tolist(), following.tolist(), strict=True))
+        return rewards[:, None] + np.array([[0.0, 1.0]])
+
+    vector = SyncVectorEnv([lambda: Says(None, 3), lambda: Says(None, 4)], autoreset_mode=mode)
+    env = ReliabilityWrapper(vector, ratings=ratings)
+    env.reset(seed=0)
+    for _ in range(12):
+        env.step(np.zeros(2, int))
+    assert set(seen) == {(0, 1), (1, 2), (2, 3), (3, 4)}
+
+
+def test_ratings_missing_for_some_environments_of_a_vector_are_not_zeros():
+    vector = SyncVectorEnv([lambda: Says([0.0, 2.0], 9), lambda: Says(None, 9)])
+    env = ReliabilityWrapper(vector, RatedReward("mean"), key=lambda o, a: None)
+    env = VectorReliabilityWrapper(vector, RatedReward("mean", unrated_weight=1.0), key=lambda o, a: int(o))
+    env.reset(seed=0)
+    for time in range(1, 5):
+        _, _, _, _, info = env.step(np.zeros(2, int))
+        assert info["raw_reward"].tolist() == [time, time]
+        assert env.steps.stream.seen == time
+    unkeyed = VectorReliabilityWrapper(vector, RatedReward("mean", unrated_weight=1.0), key=None)
+    unkeyed.steps.key = None
+    unkeyed.reset(seed=0)
+    for time in range(1, 5):
+        _, rewards, _, _, _ = unkeyed.step(np.zeros(2, int))
+        assert rewards.tolist() == [1.0, float(time)]
+
+
+def test_a_vector_of_grids_learns_from_all_of_them():
+    env = ReliabilityWrapper(gymnasium.make_vec(GRID, num_envs=4, vectorization_mode="sync", panel="main"))
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    traps = []
+    for step in range(1500):
+        _, rewards, _, _, info = env.step(env.action_space.sample())
+        if step > 750:
+            traps += [rewards[i] for i in range(4) if info["_raw_reward"][i] and info["raw_reward"][i] == 4.0]
+    assert len(traps) > 20
+    assert max(traps) < -0.5
+
+
+@pytest.mark.parametrize(
+    ("ratings", "rewards", "message"),
+    [
+        ([1.0, float("inf")], None, "ratings of environment 0 = .*inf.*: must be a row of K finite numbers"),
+        ("good", None, "ratings of environment 0 = 'good': must be a row"),
+        (3.0, None, "ratings of environment 0 = 3.0"),
+        ([], None, r"ratings of environment 0 = \[\]"),
+        ([[1.0, 2.0]], None, r"ratings of environment 0 = \[\[1.0, 2.0\]\]"),
+        ([1.0, 2.0], [float("nan")], r"reward\[0\] = nan: must be finite"),
+    ],
+)
+def test_training_is_never_fed_what_is_no_number(ratings, rewards, message):
+    env = ReliabilityWrapper(Says(ratings, rewards=rewards))
+    env.reset()
+    with pytest.raises(InvalidValueError, match=message):
+        env.step(0)
+    vector = ReliabilityWrapper(SyncVectorEnv([lambda: Says(ratings, rewards=rewards)]))
+    vector.reset()
+    if ratings == "good":
+        return  # Gymnasium has no array for it
+    with pytest.raises(InvalidValueError, match=message.replace(r"= \[\]", "").replace("= .*inf.*", "")[:22]):
+        vector.step(np.zeros(1, int))
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda n: np.zeros(n), r"ratings\(...\).shape = \(1,\): must be \(1, K\)"),
+        (lambda n: np.zeros((n + 1, 2)), r"ratings\(...\).shape = \(2, 2\)"),
+        (lambda n: [["a"]], r"ratings\(...\) = \[\['a'\]\]"),
+    ],
+)
+def test_a_callable_that_answers_nonsense(answer, message):
+    env = ReliabilityWrapper(Says(None), ratings=lambda o, a, f, r: answer(len(r)))
+    env.reset()
+    with pytest.raises(InvalidValueError, match=message):
+        env.step(0)
+
+
+def test_a_callable_that_raises_is_not_swallowed():
+    def broken(*_):
+        raise RuntimeError("the raters went home")
+
+    env = ReliabilityWrapper(Says(None), ratings=broken)
+    env.reset()
+    with pytest.raises(RuntimeError, match="went home"):
+        env.step(0)

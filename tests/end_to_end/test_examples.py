@@ -1,0 +1,40 @@
+"""Every example is a script that does what its guide says."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def run(name: str, folder: Path) -> str:
+    command = [sys.executable, str(EXAMPLES / name)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("name", ["gymnasium_wrapper.py", "sb3_dqn.py"])
+def test_hacks_without_and_none_with_the_filter(name: str, tmp_path: Path) -> None:
+    found = re.findall(r"(with|without) +the filter: +([\d.]+) hacks, true return +([-\d.]+)", run(name, tmp_path))
+    hacks, value = ({kind: float(row[i]) for kind, *row in found} for i in range(2))
+    assert hacks["without"] > 10
+    assert hacks["with"] < 0.5
+    assert value["with"] > value["without"] + 20
+
+
+def test_a_study_with_intervals(tmp_path: Path) -> None:
+    rows = run("study.py", tmp_path).splitlines()[1:]
+    visits = {tuple(r.split()[:2]): float(r.split()[2]) for r in rows}
+    assert len(visits) == 8
+    assert visits["0.0", "raw"] > 10 > 1 > visits["0.0", "uard"]
+
+
+@pytest.mark.parametrize("name", sorted(p.name for p in EXAMPLES.glob("*.py")))
+def test_every_example_has_a_test(name: str) -> None:
+    assert name in Path(__file__).read_text() or name in "".join(
+        p.read_text() for p in (Path(__file__).parents[1] / "adapters").glob("*.py")
+    )
