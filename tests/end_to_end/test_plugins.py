@@ -168,7 +168,7 @@ def test_a_cell_is_keyed_by_class_and_fields(example):
 
 def test_workers_train_them_as_this_process_does_and_the_leaderboard_has_their_row(example):
     here, there = Store(":memory:"), Store(":memory:")
-    cells = [Cell(example.BellCorridor(), m, episodes=200) for m in (Raw(), named("uard"), example.Ceiling(0.1))]
+    cells = [Cell(example.BellCorridor(), m) for m in (Raw(), named("uard"), example.Ceiling(0.1))]
     jobs = [(c, seed) for c in cells for seed in (0, 1, 2)]
     runner.run(jobs, here, workers=0)
     runner.run(jobs, there, workers=2)
