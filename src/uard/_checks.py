@@ -16,7 +16,7 @@ class InvalidValueError(ValueError):
 
     def __init__(self, field: str, value: object, allowed: str):
         """Say that ``field`` has ``value`` but must be ``allowed``."""
-        super().__init__(f"{field} = {_short(value)}: must be {allowed}")
+        super().__init__(f"{field} = {short(value)}: must be {allowed}")
         self.field = field
 
 
@@ -31,9 +31,16 @@ class UnknownNameError(InvalidValueError):
         super().__init__(field, value, f"one of {', '.join(names)}{hint}")
 
 
-def _short(value: object) -> str:
+def short(value: object) -> str:
+    """Return the value as text of at most 80 characters."""
     text = repr(value)
     return text if len(text) <= 80 else text[:77] + "..."
+
+
+def is_frozen(value: object) -> bool:
+    """Whether ``value`` is a frozen dataclass."""
+    parameters = getattr(type(value), "__dataclass_params__", None)
+    return parameters is not None and parameters.frozen
 
 
 def choose(field: str, value: str, known: Iterable[str]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -74,6 +74,8 @@ class Reproduce:
 
     studies: Positional[tuple[str, ...]] = ()
     """Which studies or groups of them (see `uard list`): grid if left out, grid-deep, games."""
+    mitigation: Annotated[_Pairs, arg(metavar="NAME")] = ()
+    """Let this one, your own perhaps, join every study that compares mitigations. Repeatable."""
     seeds: int = 10
     """Number of seeds (0, 1, ...)."""
     report: str | None = None
@@ -84,6 +86,12 @@ class Reproduce:
     """Where finished seeds are kept."""
     workers: int | None = None
     """Processes; one per core if left out."""
+    engine: str = "local"
+    """Who trains: local (processes of this machine) or ray (a Ray cluster)."""
+    address: str | None = None
+    """Of the Ray cluster's head, host:port, or auto; if left out, Ray is started on this machine."""
+    gpus: float = 0.0
+    """GPUs of a Ray task, a fraction perhaps."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +118,16 @@ class BestOfN:
     """Number of seeds (0, 1, ...); about a second each."""
     json: str | None = None
     """Write one JSON object to this file; - for standard output."""
+
+
+@dataclass(frozen=True)
+class Leaderboard:
+    """Write a page that ranks mitigations over everything that a store holds, your own included."""
+
+    store: str = DEFAULT_STORE
+    """Where finished seeds are kept; nothing is trained."""
+    out: str = "leaderboard.html"
+    """The page."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +171,7 @@ Command = (
     | Annotated[Ledger, tyro.conf.subcommand("ledger")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[BestOfN, tyro.conf.subcommand("best-of-n")]
+    | Annotated[Leaderboard, tyro.conf.subcommand("leaderboard")]
     | Annotated[List, tyro.conf.subcommand("list")]
 )
 
@@ -170,15 +189,14 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     console = Console(stderr=True, highlight=False)
     try:
+        from uard.lab.cluster import ClusterError
         from uard.lab.runner import StudyFailedError
         from uard.lab.store import StoreError
     except ModuleNotFoundError as error:
         sys.exit(f"{_NEEDS_LAB} ({error})")
     try:
-        {Run: _run, Reproduce: _reproduce, Ledger: _ledger, Doctor: _doctor, BestOfN: _best_of_n, List: _list}[
-            type(command)
-        ](command, console)
-    except (InvalidValueError, StoreError) as error:
+        _BODIES[type(command)](command, console)
+    except (ClusterError, InvalidValueError, StoreError) as error:
         console.print(f"[red]error:[/red] {_escape(str(error))}", soft_wrap=True)
         sys.exit(2)
     except StudyFailedError as error:
@@ -263,7 +281,7 @@ def _run(command: Run, console: Console) -> None:
         Console().print(table)
 
 
-def _train(jobs: Any, store: Any, console: Console, what: str, workers: int | None = None) -> int:
+def _train(jobs: Any, store: Any, console: Console, what: str, workers: int | None = None, engine: Any = None) -> int:
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -284,7 +302,9 @@ def _train(jobs: Any, store: Any, console: Console, what: str, workers: int | No
     )
     with Progress(*columns, console=console) as bar:
         task = bar.add_task(what, total=None)
-        return runner.run(jobs, store, workers, lambda done, total: bar.update(task, completed=done, total=total))
+        return runner.run(
+            jobs, store, workers, lambda done, total: bar.update(task, completed=done, total=total), engine
+        )
 
 
 def _check_json(target: str | None) -> None:
@@ -328,13 +348,29 @@ def _check_workers(workers: int | None) -> None:
         _checks.whole("workers", workers, low=0, high=1024)
 
 
+def _engine(command: Reproduce) -> Any:
+    from uard import _checks
+    from uard.lab.cluster import Ray
+
+    if _checks.choose("engine", command.engine, ("local", "ray")) == "ray":
+        if command.workers is not None:
+            raise _invalid("workers", command.workers, "left out with --engine ray")
+        return Ray(command.address, command.gpus)
+    for option, given in (("address", command.address), ("gpus", command.gpus)):
+        if given:
+            raise _invalid(option, given, "left out without --engine ray")
+    return None
+
+
 def _reproduce(command: Reproduce, console: Console) -> None:
     from uard import _checks, studies
     from uard.lab.store import Store
 
     _checks.whole("seeds", command.seeds, low=2, high=100_000)
     _check_workers(command.workers)
-    chosen = studies.find(command.studies)
+    engine = _engine(command)
+    _warn_of_broken(console)
+    chosen = studies.find(command.studies, command.mitigation)
     if command.report and {s.name for s in chosen} < {s.name for s in studies.grid()}:
         raise _invalid("report", command.report, "left out unless all grid studies are run")
     if command.report:
@@ -343,7 +379,7 @@ def _reproduce(command: Reproduce, console: Console) -> None:
     store = Store(command.store)
     seeds = range(command.seeds)
     jobs = [job for study in chosen for job in study.jobs(seeds)]
-    trained = _train(jobs, store, console, f"{len(chosen)} studies, {len(set(jobs))} runs", command.workers)
+    trained = _train(jobs, store, console, f"{len(chosen)} studies, {len(set(jobs))} runs", command.workers, engine)
     console.print(f"{trained} runs trained, {len(set(jobs)) - trained} were in {command.store} already")
     if command.extract is not None:
         from uard.reporting import published
@@ -354,7 +390,7 @@ def _reproduce(command: Reproduce, console: Console) -> None:
         from uard.reporting import page
 
         with console.status("writing the report"):
-            written = page.write(Path(command.report), store, seeds)
+            written = page.write(Path(command.report), store, seeds, command.mitigation)
         console.print(f"report: {written}")
     else:
         from rich.console import Console
@@ -450,20 +486,34 @@ def _best_of_n(command: BestOfN, console: Console) -> None:
             print(loss)
 
 
+def _leaderboard(command: Leaderboard, console: Console) -> None:
+    from uard.lab.store import Store
+    from uard.reporting import leaderboard
+
+    if not Path(command.store).is_file():
+        raise _invalid("store", command.store, "a file that is there; `uard reproduce` and `uard run --store` make one")
+    console.print(f"leaderboard: {leaderboard.write(Path(command.out), Store(command.store))}", soft_wrap=True)
+
+
 def _list(command: List, console: Console) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from uard import mitigation, studies
+    from uard import mitigation, plugins, studies
     from uard.envs.panels import PANELS
     from uard.lab import names
 
     out = Console()
+    brought = {kind: names.brought(kind) for kind in plugins.KINDS}
+    theirs = {
+        kind: {plugin.name: f"{value} (of {plugin.package})" for plugin, value in good.items()}
+        for kind, (good, _) in brought.items()
+    }
     rows: dict[str, dict[str, str]] = {
-        "environments": {k: str(v) for k, v in names.ENVIRONMENTS.items()},
-        "agents": {k: str(v) for k, v in names.AGENTS.items()},
+        "environments": {k: str(v) for k, v in names.ENVIRONMENTS.items()} | theirs["environment"],
+        "agents": {k: str(v) for k, v in names.AGENTS.items()} | theirs["agent"],
         "agents for Hopper and Walker2d": {k: str(v) for k, v in names.CONTINUOUS.items()},
-        "mitigations": {k: str(mitigation.named(k)) for k in mitigation.NAMED},
+        "mitigations": {k: str(mitigation.named(k)) for k in mitigation.NAMED} | theirs["mitigation"],
         "panels": {k: (v.__doc__ or "").split("\n")[0] for k, v in PANELS.items()},
         **{
             f"studies of {group}": {s.name: f"{s.title} ({s.answers}; {len(s.rows)} cells)" for s in members}
@@ -476,3 +526,25 @@ def _list(command: List, console: Console) -> None:
             table.add_row(f"[bold]{name}[/bold]", _escape(text))
         out.print(table)
         out.print()
+    _warn_of_broken(console)
+
+
+def _warn_of_broken(console: Console) -> None:
+    """Say which plugins cannot be used, and why."""
+    from uard import plugins
+    from uard.lab import names
+
+    for kind in plugins.KINDS:
+        for error in names.brought(kind)[1]:
+            console.print(f"[yellow]warning:[/yellow] {_escape(str(error))}", soft_wrap=True)
+
+
+_BODIES: dict[type, Callable[[Any, Console], None]] = {
+    Run: _run,
+    Reproduce: _reproduce,
+    Ledger: _ledger,
+    Doctor: _doctor,
+    BestOfN: _best_of_n,
+    Leaderboard: _leaderboard,
+    List: _list,
+}

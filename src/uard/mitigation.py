@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
-from uard import _checks, adaptation, uncertainty
+from uard import _checks, adaptation, plugins, uncertainty
 from uard.reliability import Array, ReliabilityFilter, discount, namespace
 
 Backup = Literal["greedy", "consistent"]
@@ -384,9 +384,17 @@ NAMED: dict[str, Callable[..., Mitigation]] = {
 
 
 def named(name: str, **parameters: Any) -> Mitigation:
-    """Return the mitigation of that name, with some parameters changed.
+    """Return the mitigation of that name, ours or a plugin's (``uard.plugins``), with some parameters changed.
 
     Raises:
         UnknownNameError: with the nearest name.
+        PluginError: a plugin that cannot be used.
     """
-    return NAMED[_checks.choose("mitigation", name, NAMED)](**parameters)
+    if name in NAMED:
+        return NAMED[name](**parameters)
+    return plugins.pick("mitigation", name, NAMED, [*NAMED]).load(is_mitigation)(**parameters)
+
+
+def is_mitigation(value: object) -> bool:
+    """Whether ``value`` has what a mitigation has."""
+    return isinstance(value, Mitigation)

@@ -73,7 +73,7 @@ class Cell:
         _checks.whole("snapshots", self.snapshots, low=0, high=1000)
         for name, kind in (("environment", Spec | Locomotion), ("mitigation", Mitigation), ("agent", names.Agent)):
             value = getattr(self, name)
-            if not isinstance(value, kind) or not _is_frozen(value):
+            if not isinstance(value, kind) or not _checks.is_frozen(value):
                 raise _checks.InvalidValueError(name, value, f"a frozen dataclass that is {_an(kind)}")
             object.__setattr__(self, name, _settled(name, value))
         names.check_pair(self.agent, self.environment)
@@ -128,18 +128,13 @@ def _an(kind: Any) -> str:
     return "a " + " or a ".join(k.__name__ for k in kinds)
 
 
-def _is_frozen(value: Any) -> bool:
-    parameters = getattr(type(value), "__dataclass_params__", None)
-    return parameters is not None and parameters.frozen
-
-
 def _settled(name: str, value: Any) -> Any:
     """Bring equal settings (2 and 2.0, 0.0 and -0.0, NumPy's numbers) to one form, so that their keys are equal.
 
     Raises:
         InvalidValueError: a setting that cannot be part of a key.
     """
-    if _is_frozen(value):
+    if _checks.is_frozen(value):
         changes = {}
         for f in dataclasses.fields(value):
             old = getattr(value, f.name)

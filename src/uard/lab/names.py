@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Callable
 from typing import Any
 
-from uard import _checks, mitigation
+from uard import _checks, mitigation, plugins
 from uard.abstention import Abstention
 from uard.agents import continuous
 from uard.agents.actor_critic import SoftActorCritic, edac
@@ -19,7 +20,7 @@ from uard.envs.classic import Acrobot, CartPole
 from uard.envs.gaming import AbsentSupervisor, BoatRace, TomatoWatering
 from uard.envs.mujoco import Locomotion, Posture, Vibration
 from uard.envs.panels import PANELS
-from uard.envs.spec import Tables
+from uard.envs.spec import Spec, Tables
 from uard.envs.trapgrid import TrapGrid
 from uard.feedback.learned import RatingModel
 from uard.mitigation import Mitigation
@@ -136,6 +137,36 @@ def agents(environment: Any) -> dict[str, Any]:
     return CONTINUOUS if isinstance(environment, Locomotion) else AGENTS
 
 
+OWN: dict[str, tuple[str, ...]] = {
+    "environment": (*ENVIRONMENTS,),
+    "agent": (*dict.fromkeys((*AGENTS, *CONTINUOUS)),),
+    "mitigation": (*mitigation.NAMED,),
+}
+IS_ONE: dict[str, Callable[[Any], bool]] = {
+    "environment": lambda value: isinstance(value, Spec | Locomotion),
+    "agent": lambda value: isinstance(value, Agent),
+    "mitigation": mitigation.is_mitigation,
+}
+
+
+def brought(kind: str) -> tuple[dict[plugins.Plugin, Any], list[plugins.PluginError]]:
+    """Return what other packages bring of a kind ("environment", "agent", "mitigation"), and what of it is broken."""
+    good: dict[plugins.Plugin, Any] = {}
+    bad = plugins.clashes(kind, OWN[kind])
+    for plugin in plugins.usable(kind, OWN[kind]).values():
+        try:
+            good[plugin] = plugin.load(IS_ONE[kind])()
+        except plugins.PluginError as error:
+            bad.append(error)
+    return good, bad
+
+
+def _of(kind: str, name: str, ours: dict[str, Any]) -> Any:
+    if name in ours:
+        return ours[name]
+    return plugins.pick(kind, name, OWN[kind], [*ours]).load(IS_ONE[kind])()
+
+
 def settings(pairs: tuple[str, ...], option: str = "--set") -> dict[str, Any]:
     """Read ``name=value`` pairs; values are JSON, or else text.
 
@@ -184,7 +215,7 @@ def changed(base: Any, changes: dict[str, Any], what: str) -> Any:
 
 def environment(name: str, changes: dict[str, Any]) -> Any:
     """Return an environment by name. A new size, unless more is said, brings its own traps, goal and horizon."""
-    base = ENVIRONMENTS[_checks.choose("environment", name, ENVIRONMENTS)]
+    base = _of("environment", name, ENVIRONMENTS)
     if isinstance(base, TrapGrid) and changes.get("size", base.size) != base.size:
         base = TrapGrid(trap_reward=base.trap_reward, legitimate=base.legitimate)
         base = _bare(base)
@@ -205,8 +236,7 @@ def agent(name: str, changes: dict[str, Any], environment: Any = None) -> Agent:
 
     ``abstention.rule`` and the like make a tabular one abstain.
     """
-    known = agents(environment)
-    base = known[_checks.choose("agent", name, known)]
+    base = _of("agent", name, agents(environment))
     if isinstance(base, QLearning) and any(field.partition(".")[0] == "abstention" for field in changes):
         base = dataclasses.replace(base, abstention=Abstention())
     return changed(base, changes, "agent")

@@ -179,7 +179,13 @@ def _train_deep(batch: Sequence[Job]) -> list[Callable[[], Result]]:
     return [partial(finish_deep, cell, seed, outcome) for (cell, seed), outcome in zip(batch, out, strict=True)]
 
 
-def run(jobs: Sequence[Job], store: Store, workers: int | None = None, progress: Progress | None = None) -> int:
+def run(
+    jobs: Sequence[Job],
+    store: Store,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    engine: Engine | None = None,
+) -> int:
     """Train the jobs that are not in the store yet; return how many that were.
 
     Args:
@@ -187,6 +193,7 @@ def run(jobs: Sequence[Job], store: Store, workers: int | None = None, progress:
         store: Receives every finished batch at once, so an interrupt loses at most what is in flight.
         workers: Processes, one per core if left out; up to 1 trains in this one.
         progress: Called with (finished, to do) after every batch.
+        engine: What trains the batches instead of processes on this machine, such as ``uard.lab.cluster.Ray``.
 
     Raises:
         StudyFailedError: some jobs raised; all others are stored.
@@ -204,7 +211,10 @@ def run(jobs: Sequence[Job], store: Store, workers: int | None = None, progress:
     if progress:
         progress(0, len(todo))
     folder = None if store.path == ":memory:" else Path(f"{store.path}-checkpoints")
-    outcomes = _here(queue, folder) if workers <= 1 or len(queue) == 1 else _spread(queue, workers, folder)
+    if engine is not None:
+        outcomes = engine(queue, folder, list)
+    else:
+        outcomes = _here(queue, folder) if workers <= 1 or len(queue) == 1 else _spread(queue, workers, folder)
     for batch, answer in outcomes:
         answers = [answer] * len(batch) if isinstance(answer, str) else [_kept(a, store) for a in answer]
         pairs = list(zip(batch, answers, strict=True))
@@ -242,6 +252,8 @@ def _kept(answer: Result | DivergedError | str, store: Store) -> Result | str:
 # Per job its result, the divergence or a traceback; or one traceback for all of them.
 Answer = list[Result | DivergedError | str] | str
 Outcomes = Iterable[tuple[list[Job], Answer]]
+Claim = Callable[[list[Job]], list[Job]]  # of a batch, what of it is to be trained: called when it is handed out
+Engine = Callable[[list[list[Job]], Path | None, Claim], Outcomes]  # of batches (longest first), a folder, a claim
 
 
 def _here(queue: Iterable[list[Job]], folder: Path | None) -> Outcomes:

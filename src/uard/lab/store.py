@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from uard import __version__
 from uard.lab.cell import Cell
@@ -27,6 +30,21 @@ _COLUMNS = {"key", "seed", "data", "checksum", "metrics", "version", "created"} 
 
 class StoreError(RuntimeError):
     """The result store cannot be used; the message names the file and says what to do."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a store says of one cell, without its curves.
+
+    Attributes:
+        config: ``Cell.config``, as it was when the cell was trained.
+        metrics: By seed.
+        failed: Seeds that could not be trained when that was last tried.
+    """
+
+    config: dict[str, Any]
+    metrics: dict[int, dict[str, float]]
+    failed: int
 
 
 class Store:
@@ -153,6 +171,21 @@ class Store:
     def quarantined(self) -> list[tuple[str, int, str]]:
         """Return (key, seed, reason) of every result that was found corrupt."""
         return [tuple(row) for row in self._db.execute("select key, seed, reason from quarantine")]
+
+    def cells(self) -> list[Stored]:
+        """Return all cells, whatever program wrote them; they are as sound as they were when ``have`` last looked."""
+        metrics: dict[str, dict[int, dict[str, float]]] = defaultdict(dict)
+        for key, seed, text in self._db.execute("select key, seed, metrics from results order by seed"):
+            metrics[key][seed] = json.loads(text)
+        failed: dict[str, int] = {}
+        if self._db.execute("select 1 from sqlite_master where name = 'failures'").fetchone():
+            failed = dict(self._db.execute("select key, count(*) from failures group by key"))
+        configs = dict(self._db.execute("select key, config from cells"))
+        return [
+            Stored(json.loads(config), metrics[key], failed.get(key, 0))
+            for key, config in configs.items()
+            if key in metrics or key in failed
+        ]
 
     def count(self) -> tuple[int, int]:
         """Return the numbers of cells and of finished seeds."""

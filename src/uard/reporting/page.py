@@ -16,7 +16,18 @@ from uard import InvalidValueError, __version__, statistics, studies
 from uard.lab.result import CALIBRATION, WINDOW
 from uard.lab.store import Store
 from uard.lab.study import Row
-from uard.reporting import audit, deep, figures, ledger, locomotion, overoptimisation, paper, published, theory
+from uard.reporting import (
+    audit,
+    deep,
+    figures,
+    leaderboard,
+    ledger,
+    locomotion,
+    overoptimisation,
+    paper,
+    published,
+    theory,
+)
 from uard.reporting.evidence import Evidence
 from uard.reporting.tables import Table, brief, full, number, study_table
 from uard.statistics import Summary
@@ -24,8 +35,14 @@ from uard.statistics import Summary
 _PACKAGES = ("jax", "numpy", "scipy", "gymnasium", "matplotlib")
 
 
-def write(folder: Path, store: Store, seeds: Sequence[int]) -> Path:
-    """Write ``index.html`` and ``ledger.json`` into a folder and return the page's path.
+def write(folder: Path, store: Store, seeds: Sequence[int], mitigations: tuple[str, ...] = ()) -> Path:
+    """Write ``index.html``, ``leaderboard.html`` and ``ledger.json`` into a folder and return the first one's path.
+
+    Args:
+        folder: Made if it is not there.
+        store: Holds all grid studies, and whatever else the leaderboard shows.
+        seeds: Over these.
+        mitigations: Further ones that took part in the studies.
 
     Raises:
         InvalidValueError: the folder cannot be written.
@@ -33,7 +50,7 @@ def write(folder: Path, store: Store, seeds: Sequence[int]) -> Path:
     """
     import jinja2
 
-    chosen = studies.grid()
+    chosen = studies.find(("grid",), mitigations)
     evidence = Evidence(store, seeds, chosen)
     entries = ledger.entries(evidence)
     best_of_n = deep.packaged_json("best-of-n.json")
@@ -78,6 +95,7 @@ def write(folder: Path, store: Store, seeds: Sequence[int]) -> Path:
         target.write_text(page, encoding="utf-8")
     except OSError as error:
         raise InvalidValueError("report", str(folder), f"a folder that can be written ({error})") from None
+    leaderboard.write(folder / "leaderboard.html", store)
     return target
 
 

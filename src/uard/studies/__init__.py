@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from uard import _checks
 from uard.lab.study import Study
-from uard.studies import deep, locomotion, ours, paper
+from uard.studies import deep, locomotion, ours, own, paper
 
 
 def grid() -> tuple[Study, ...]:
@@ -18,7 +18,8 @@ def groups() -> dict[str, tuple[Study, ...]]:
         f"mujoco-{scale.name}": locomotion.studies(scale)
         for scale in (locomotion.SMOKE, locomotion.STANDARD, locomotion.PAPER)
     }
-    return {"grid": grid(), "grid-deep": deep.studies(), "games": deep.others(), **sizes}
+    ours_and_theirs = {"grid": grid(), "grid-deep": deep.studies(), "games": deep.others(), **sizes}
+    return ours_and_theirs | ({"plugins": brought} if (brought := own.brought()) else {})
 
 
 def every() -> tuple[Study, ...]:
@@ -26,14 +27,20 @@ def every() -> tuple[Study, ...]:
     return tuple(study for group in groups().values() for study in group)
 
 
-def find(names: tuple[str, ...]) -> tuple[Study, ...]:
+def find(names: tuple[str, ...], mitigations: tuple[str, ...] = ()) -> tuple[Study, ...]:
     """Return the studies of these names or groups; all grid studies for none.
+
+    Args:
+        names: Of studies and groups.
+        mitigations: Further ones, which join every study that compares mitigations.
 
     Raises:
         UnknownNameError: with the nearest name.
+        InvalidValueError: mitigations are to join, and none of the studies compares any.
     """
-    known = {s.name: (s,) for s in every()} | groups()
+    together = groups()
+    known = {s.name: (s,) for group in together.values() for s in group} | together
     chosen: dict[str, Study] = {}
     for name in names or ("grid",):
         chosen |= {s.name: s for s in known[_checks.choose("study", name, known)]}
-    return tuple(chosen.values())
+    return own.compared_with(chosen.values(), mitigations)

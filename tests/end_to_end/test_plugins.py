@@ -1,0 +1,255 @@
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from uard import InvalidValueError, cli, mitigation, plugins, studies
+from uard._checks import UnknownNameError
+from uard.agents.tabular import QLearning
+from uard.lab import names, runner
+from uard.lab.cell import Cell
+from uard.lab.store import Store
+from uard.mitigation import Raw, named
+from uard.plugins import PluginError
+from uard.reporting import leaderboard
+from uard.studies import own
+
+pytestmark = pytest.mark.slow
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "uard-plugin-example"
+BROKEN = """
+from dataclasses import dataclass
+from uard.mitigation import Mitigation, Raw
+
+@dataclass(frozen=True)
+class Mine(Raw):
+    pass
+
+@dataclass
+class Thawed(Mitigation):
+    def signal(self, evidence, usual):
+        return evidence.reward
+
+def three():
+    return 3
+
+def raises():
+    raise RuntimeError("not today")
+"""
+ENTRIES = """
+[uard.mitigations]
+gone = no_such_module:Thing
+missing = uard_broken:Nothing
+three = uard_broken:three
+raises = uard_broken:raises
+thawed = uard_broken:Thawed
+raw = uard_broken:Mine
+twice = uard_broken:Mine
+[uard.environments]
+nowhere = uard_broken:Mine
+[uard.agents]
+sac = uard_broken:Mine
+"""
+
+
+def distribution(folder, name, entries):
+    place = folder / f"{name}-1.0.dist-info"
+    place.mkdir()
+    (place / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (place / "entry_points.txt").write_text(entries)
+
+
+@pytest.fixture(scope="session")
+def installed(shared):
+    """The example as pip installs it, offline."""
+    with shared("plugins") as folder:
+        if not (target := folder / "target").exists():
+            shutil.copytree(EXAMPLE, folder / "source")
+            pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-build-isolation"]
+            subprocess.run([*pip, "--target", target, folder / "source"], check=True)
+        return target
+
+
+@pytest.fixture
+def example(installed, monkeypatch):
+    monkeypatch.syspath_prepend(installed)
+    plugins.found.cache_clear()
+    yield importlib.import_module("uard_plugin_example")
+    plugins.found.cache_clear()
+
+
+@pytest.fixture
+def broken(example, tmp_path, monkeypatch):
+    """Beside the example, two packages of which nothing works."""
+    (tmp_path / "uard_broken.py").write_text(BROKEN)
+    distribution(tmp_path, "broken", ENTRIES)
+    distribution(tmp_path, "other", "[uard.mitigations]\ntwice = uard_broken:Mine\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    plugins.found.cache_clear()
+
+
+def listed(capsys):
+    cli.main(["list"])
+    out, err = capsys.readouterr()
+    return {line.split()[0] for line in out.splitlines() if line.strip()}, " ".join(out.split()), err
+
+
+def test_they_are_listed_with_their_package(example, capsys):
+    names_, text, err = listed(capsys)
+    assert names_ >= {"ceiling", "BellCorridor", "softmax-dqn", "own", *mitigation.NAMED, *names.ENVIRONMENTS}
+    assert "ceiling Ceiling(slack=0.5) (of uard-plugin-example 0.1)" in text
+    assert err == ""
+
+
+def test_broken_ones_are_told_and_disturb_nobody(broken, capsys):
+    names_, _, err = listed(capsys)
+    assert names_ >= {"ceiling", "BellCorridor", "softmax-dqn", *mitigation.NAMED}
+    warnings = sorted(line.removeprefix("warning: ") for line in err.splitlines())
+    assert [w.split(":")[0].split(" = ")[1] for w in warnings] == [
+        "'sac'",
+        "'nowhere'",
+        *("'gone'", "'missing'", "'raises'", "'raw'", "'thawed'", "'three'", "'twice'", "'twice'"),
+    ]
+    assert all("of package broken 1.0: " in w or "of package other 1.0: " in w for w in warnings)
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("gone", "entry point gone = no_such_module:Thing of package broken 1.0: ModuleNotFoundError: No module named"),
+        ("missing", "entry point missing = .* of package broken 1.0: AttributeError: .*Nothing"),
+        ("three", "3 is no frozen dataclass that is a mitigation"),
+        ("raises", "RuntimeError: not today"),
+        ("thawed", "is no frozen dataclass that is a mitigation"),
+        ("twice", "the name is also brought by other 1.0"),
+    ],
+)
+def test_a_broken_one_says_why_when_it_is_asked_for(broken, name, why):
+    with pytest.raises(PluginError, match=why):
+        named(name)
+
+
+def test_what_is_of_another_kind_or_has_our_name_is_not_taken(broken):
+    with pytest.raises(PluginError, match=r"Mine\(\) is no frozen dataclass that is an environment"):
+        names.environment("nowhere", {})
+    assert type(named("raw")) is Raw
+    assert names.agent("sac", {}) == names.AGENTS["sac"]
+    with pytest.raises(UnknownNameError, match="did you mean 'ceiling'"):
+        named("cieling")
+
+
+def test_fields_are_set_like_those_of_ours(example):
+    assert names.mitigation_named("ceiling", {"slack": 1}) == named("ceiling", slack=1.0) == example.Ceiling(1.0)
+    assert names.environment("BellCorridor", {"length": 11}) == example.BellCorridor(11)
+    assert names.agent("softmax-dqn", {"heat": 1, "network.hidden": 16}).network.hidden == 16
+    with pytest.raises(InvalidValueError, match="slack = -1"):
+        named("ceiling", slack=-1)
+    hopper = names.ENVIRONMENTS["Hopper"]
+    with pytest.raises(InvalidValueError, match="one that can work in Locomotion"):
+        Cell(hopper, agent=names.agent("softmax-dqn", {}, hopper))
+
+
+def test_a_cell_is_keyed_by_class_and_fields(example):
+    cell = Cell(example.BellCorridor(), example.Ceiling())
+    config = cell.config()
+    assert config["mitigation"] == {"class": "uard_plugin_example.Ceiling", "slack": 0.5}
+    assert config["environment"]["class"] == "uard_plugin_example.BellCorridor"
+    others = [
+        cell.with_(mitigation=example.Ceiling(0.4)),
+        cell.with_(environment=example.BellCorridor(legitimate=True)),
+    ]
+    assert len({c.key for c in (cell, *others)}) == 3
+    assert cell.with_(mitigation=example.Ceiling(0.5)).key == cell.key
+
+
+def test_workers_train_them_as_this_process_does_and_the_leaderboard_has_their_row(example):
+    here, there = Store(":memory:"), Store(":memory:")
+    cells = [Cell(example.BellCorridor(), m) for m in (Raw(), named("uard"), example.Ceiling(0.1))]
+    jobs = [(c, seed) for c in cells for seed in (0, 1, 2)]
+    runner.run(jobs, here, workers=0)
+    runner.run(jobs, there, workers=2)
+    for c, seed in jobs:
+        assert here.get(c, [seed])[seed].pack() == there.get(c, [seed])[seed].pack()
+    board = {x.mitigation: x for x in leaderboard.lines(there)}
+    assert board.keys() == {"raw", "uard", "ceiling, slack 0.1"}
+    assert {x.environment for x in board.values()} == {"BellCorridor"}
+    assert board["raw"].hacks.low > 0.5, "the bell is worth hacking"
+    assert board["raw"].hacks.above(board["ceiling, slack 0.1"].hacks)
+    here.close()
+    there.close()
+
+
+def test_a_deep_agent_of_a_package_learns_from_the_command_line(installed):
+    """In a process of its own, as a user has it."""
+    path = os.pathsep.join([str(installed), os.environ.get("PYTHONPATH", "")])
+    options = [
+        "--set",
+        "length=3",
+        "--agent",
+        "softmax-dqn",
+        "--set-agent",
+        "network.hidden=8",
+        "--mitigation",
+        "ceiling",
+    ]
+    done = subprocess.run(
+        [Path(sys.executable).parent / "uard", "run", "BellCorridor", *options, "--seeds", "1", "--episodes", "20"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": path},
+    )
+    assert done.returncode == 0, done.stderr
+    assert "BellCorridor / softmax-dqn / ceiling" in done.stdout
+
+
+def test_a_mitigation_joins_every_study_that_compares_some(example):
+    plain, joined = studies.every(), studies.find(tuple(studies.groups()), ("ceiling",))
+    grown = {b.name: len(b.rows) - len(a.rows) for a, b in zip(plain, joined, strict=True) if len(b.rows) > len(a.rows)}
+    assert grown.keys() >= {"matrix", "legitimate", "budgets", "unseen", "sources", "deep-rivals", "gaming"}
+    assert grown["matrix"] == 126
+    for study in joined:
+        for row in study.where(mitigation="ceiling"):
+            assert row.cell.mitigation == example.Ceiling()
+            if study.name != "own":
+                twin = study.one(**dict(row.labels) | {"mitigation": "uard"} | _sources(row))
+                assert row.cell == twin.cell.with_(mitigation=example.Ceiling())
+
+
+def _sources(row):
+    return {"sources": "sigma_m and sigma_h"} if "sources" in dict(row.labels) else {}
+
+
+def test_one_that_is_there_already_joins_nothing():
+    assert studies.find(("matrix",), ("lcb", "lcb")) == studies.find(("matrix",))
+    with pytest.raises(InvalidValueError, match="none of scale, control compares mitigations"):
+        studies.find(("scale", "control"), ("lcb",))
+    with pytest.raises(UnknownNameError):
+        studies.find(("matrix",), ("nonsense",))
+
+
+def test_what_packages_bring_has_a_study(example):
+    (study,) = own.brought()
+    assert study.name == "own"
+    everywhere = {(r["environment"], r["agent"], r["panel"]) for r in study.rows}
+    assert everywhere == {
+        *(("BellCorridor", "q-learning", p) for p in ("main", "appendix", "colluding")),
+        *(("BellCorridor, legitimate", "q-learning", p) for p in ("main", "appendix")),
+        *(("TrapGrid6", "softmax-dqn", p) for p in ("main", "appendix", "colluding")),
+        *(("TrapGrid6, legitimate", "softmax-dqn", p) for p in ("main", "appendix")),
+    }
+    assert {r["mitigation"] for r in study.rows} == {*own.mitigations()} >= {"raw", "uard", "ceiling"}
+    assert len(study.rows) == len(everywhere) * len(own.mitigations())
+    assert all(r.cell.environment.legitimate == r["environment"].endswith("legitimate") for r in study.rows)
+    assert isinstance(study.rows[0].cell.agent, QLearning)
+
+
+def test_nothing_is_imported_before_it_is_asked_for(installed):
+    code = "import sys, uard.mitigation as m; m.named('uard'); print('uard_plugin_example' in sys.modules)"
+    path = os.pathsep.join([str(installed), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=os.environ | {"PYTHONPATH": path})
+    assert done.stdout.strip() == b"False"
