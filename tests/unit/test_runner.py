@@ -287,7 +287,12 @@ def test_an_interrupt_loses_nothing_that_was_finished(tmp_path):
 
 def test_every_core_is_used_if_nothing_is_said(monkeypatch):
     asked = []
-    monkeypatch.setattr(runner, "_spread", lambda queue, workers, *_: iter(asked.append((len(queue), workers)) or ()))
+
+    def spread(queue, workers, *_):
+        asked.append((len(queue), workers))
+        yield from ()
+
+    monkeypatch.setattr(runner, "_spread", spread)
     store = Store(":memory:")
     run([(cell(named("raw"), episodes=n), 0) for n in (1, 2)], store)
     store.close()

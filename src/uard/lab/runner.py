@@ -238,7 +238,8 @@ def run(
             others = [job for job in batch if job not in taken]
             refused.extend(others)
             forecast.drop(others)
-            forecast.begin(mine, time.monotonic())
+            if mine:
+                forecast.begin(mine, time.monotonic())
             return mine
 
         def tell() -> None:

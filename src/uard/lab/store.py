@@ -64,6 +64,7 @@ class Run:
         failed: Those that failed.
         remaining: Seconds that it thought it would still need; None if it could not know.
         ended: When it stopped in good order; None if it runs, or died.
+        claimed: Seeds that it trains, or trained when it died.
     """
 
     owner: Owner
@@ -74,6 +75,7 @@ class Run:
     failed: int
     remaining: float | None
     ended: float | None
+    claimed: int
 
     @property
     def alive(self) -> bool:
@@ -242,6 +244,26 @@ class Store:
                 self._quarantine(cell.key, seed, data, "checksum does not match")
         return sound
 
+    def stored(self, key: str) -> tuple[dict[int, tuple[bytes, dict[str, float]]], list[int]]:
+        """Return bytes and metrics of a cell's seeds, and which seeds are corrupt; nothing is changed."""
+        query = "select seed, data, metrics, checksum from results where key = ?"
+        sound, corrupt = {}, []
+        for seed, data, metrics, checksum in self._db.execute(query, (key,)):
+            if digest(data + metrics.encode()) == checksum:
+                sound[seed] = data, json.loads(metrics)
+            else:
+                corrupt.append(seed)
+        return sound, corrupt
+
+    def configs(self) -> dict[str, str]:
+        """Return the configuration, as JSON, of every cell that has a finished seed, by key."""
+        query = "select key, config from cells where exists (select 1 from results where results.key = cells.key)"
+        return dict(self._db.execute(query).fetchall())
+
+    def versions(self) -> tuple[str, ...]:
+        """Return the versions of the program that trained what is here."""
+        return tuple(row[0] for row in self._db.execute("select distinct version from results order by version"))
+
     def _quarantine(self, key: str, seed: int, data: bytes, reason: str) -> None:
         with self._db:
             self._db.execute("insert into quarantine values (?, ?, ?, ?, ?)", (key, seed, data, reason, time.time()))
@@ -316,10 +338,11 @@ class Store:
                 )
 
     def runs(self) -> list[Run]:
-        """Return who has worked here and not ended, or was last to end, in the order in which they began."""
+        """Return who works here, or died and was not replaced, or was last to end, in the order of their beginning."""
         query = """
-            select token, host, place, pid, born, began, beat, total, done, failed, remaining, ended from runs
-            where ended is null or ended = (select max(ended) from runs) order by began
+            select token, host, place, pid, born, began, beat, total, done, failed, remaining, ended,
+                (select count(*) from claims where claims.token = runs.token)
+            from runs where ended is null or ended = (select max(ended) from runs) order by began
         """
         return [Run(Owner(*row[:5]), *row[5:]) for row in self._db.execute(query)]
 

@@ -1,0 +1,214 @@
+"""A study is killed at random points, by whatever ends processes, and by a full disk; and two work on one store.
+
+UARD_KILLS=100 makes it that many kills instead of a few.
+"""
+
+import os
+import random
+import resource
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from uard.agents.tabular import QLearning
+from uard.envs.trapgrid import TrapGrid
+from uard.lab.cell import Cell
+from uard.lab.store import Store
+
+KILLS = int(os.environ.get("UARD_KILLS", "8"))
+JOBS, WORKERS = 30, 2
+DRIVER = """
+import sys
+from uard.lab import runner
+from uard.lab.store import Store
+from test_survival import walks
+
+if __name__ == "__main__":
+    from uard import cli
+    with cli._terminable():
+        print(runner.run(walks(), Store(sys.argv[1]), int(sys.argv[2]), lambda *x: print(*x, flush=True)), flush=True)
+"""
+
+
+def walks(n=JOBS):
+    """One batch each, of one program, about a third of a second long."""
+    walker = QLearning(heads=1, epsilon=1.0, epsilon_decay=1.0, epsilon_min=1.0)
+    return [(Cell(TrapGrid(10, horizon=2000 + i), agent=walker, episodes=500), 0) for i in range(n)]
+
+
+@pytest.fixture
+def study(tmp_path):
+    """Starts the study in a process group of its own."""
+    (tmp_path / "driver.py").write_text(DRIVER)
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    started = []
+
+    def start(store="s.sqlite", workers=WORKERS, **options):
+        process = subprocess.Popen(
+            [sys.executable, "driver.py", store, str(workers)],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": path},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            **options,
+        )
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+def done(process):
+    """Wait for the first finished seeds."""
+    for line in process.stdout:
+        if not line.startswith("0 "):
+            return line
+    raise AssertionError(process.communicate())
+
+
+def blobs(path):
+    with closing(sqlite3.connect(path, timeout=60)) as db:
+        return {row[:2]: row[2:] for row in db.execute("select key, seed, data, checksum, metrics from results")}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    from uard.lab import runner
+
+    path = tmp_path_factory.mktemp("undisturbed") / "s.sqlite"
+    with closing(Store(path)) as store:
+        assert runner.run(walks(), store, workers=1) == JOBS
+    return blobs(path)
+
+
+def test_killed_at_random_points_a_study_ends_as_if_nothing_had_happened(study, tmp_path, undisturbed):
+    chance, kills, round_, lost_at_most = random.Random(20261122), 0, 0, 0
+    while kills < KILLS:
+        round_ += 1
+        name, ended, before = f"{round_}.sqlite", False, {}
+        began, lost = 0, 0
+        while not ended:
+            process = study(name)
+            try:
+                process.communicate(timeout=chance.uniform(0, 9) if kills < KILLS else 300)
+                assert process.returncode == 0
+                ended = True
+            except subprocess.TimeoutExpired:
+                how = chance.choice([signal.SIGKILL] * 3 + [signal.SIGTERM, signal.SIGINT])
+                os.killpg(process.pid, how)
+                process.communicate(timeout=60)
+                kills += 1
+            if not (tmp_path / name).exists():
+                continue
+            with closing(Store(tmp_path / name)) as store:
+                attempts, after = store.attempts(), blobs(tmp_path / name)
+                now = sum(map(len, attempts.values()))
+                assert before.items() <= after.items(), "what was finished stays as it was"
+                assert {k: v for k, v in undisturbed.items() if k in after} == after
+                finished, tried = len(after) - len(before), now - began
+                assert tried - finished <= WORKERS, "only what was in flight is lost"
+                assert store.quarantined() == []
+            lost, began, before = lost + tried - finished, now, after
+        assert before == undisturbed
+        assert began == JOBS + lost
+        assert all(len(set(tokens)) == len(tokens) for tokens in attempts.values())
+        lost_at_most += lost
+    print(f"{kills} kills, {round_} studies of {JOBS} seeds, {lost_at_most} seeds in flight trained again")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_ends_the_real_program_at_once_with_its_code(tmp_path, number, code):
+    command = [sys.executable, "-c", "from uard.cli import main; main()", "reproduce", "scale", "--seeds", "40"]
+    log = tmp_path / "log"
+    process = subprocess.Popen(
+        [*command, "--store", str(tmp_path / "s.sqlite"), "--workers", "2", "--log", str(log)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    while process.poll() is None and not (log.exists() and "seeds done" in log.read_text()):
+        time.sleep(0.05)
+    os.killpg(process.pid, number)
+    out, error = process.communicate(timeout=20)
+    assert (process.returncode, out) == (code, "")
+    assert "every finished cell is stored, the same command goes on from there" in " ".join(error.split())
+    assert "Traceback" not in error
+    with closing(Store(tmp_path / "s.sqlite", readonly=True)) as store:
+        assert store.failures() == {}
+        assert [(run.ended is not None, run.claimed) for run in store.runs()] == [(True, 0)]
+        assert store.count()[1] > 0
+
+
+def test_two_processes_share_a_study(study, tmp_path, undisturbed):
+    both = [study(workers=1), study(workers=1)]
+    answers = [p.communicate(timeout=120) for p in both]
+    assert [(p.returncode, error) for p, (_, error) in zip(both, answers, strict=True)] == [(0, ""), (0, "")]
+    assert sum(int(out.split()[-1]) for out, _ in answers) == JOBS
+    assert all(out.splitlines()[-2].startswith(f"{JOBS} {JOBS} ") or out.split() == ["0"] for out, _ in answers)
+    assert blobs(tmp_path / "s.sqlite") == undisturbed
+    with closing(Store(tmp_path / "s.sqlite")) as store:
+        assert {len(tokens) for tokens in store.attempts().values()} == {1}
+
+
+def test_what_a_killed_process_had_in_flight_is_taken_over_by_one_that_waits(study, tmp_path, undisturbed):
+    first = study(workers=1)
+    done(first)
+    first.send_signal(signal.SIGSTOP)
+    second = study(workers=1)
+    with closing(Store(tmp_path / "s.sqlite")) as store:
+        while store.count()[1] < JOBS - 1:
+            assert second.poll() is None
+            time.sleep(0.05)
+        assert store.claimed() != {}, "the stopped one lives, and nobody takes its work"
+        first.kill()
+        first.wait()
+        out, error = second.communicate(timeout=60)
+        assert (second.returncode, error) == (0, "")
+        assert out.split()[-1] != "0"
+        assert blobs(tmp_path / "s.sqlite") == undisturbed
+        assert sorted(len(tokens) for tokens in store.attempts().values()) == [1] * (JOBS - 1) + [2]
+
+
+def test_workers_end_with_their_parent(study):
+    process = study()
+    done(process)
+    tasks = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    children = [Path(f"/proc/{pid}/stat") for pid in tasks.read_text().split()]
+    assert len(children) >= WORKERS
+    process.kill()
+    deadline = time.monotonic() + 20
+    while any(c.exists() and c.read_text().rpartition(")")[2].split()[0] != "Z" for c in children):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_a_full_disk_loses_nothing_and_the_same_command_goes_on(tmp_path):
+    command = [sys.executable, "-c", "from uard.cli import main; main()", "reproduce", "control", "--seeds", "30"]
+    options = {"cwd": tmp_path, "capture_output": True, "text": True, "check": False}
+
+    def full():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000))
+
+    first = subprocess.run([*command, "--store", "s.sqlite", "--workers", "1"], preexec_fn=full, **options)
+    assert (first.returncode, first.stdout) == (2, "")
+    assert "store = 's.sqlite': cannot be written (" in first.stderr
+    assert "Traceback" not in first.stderr
+    kept = blobs(tmp_path / "s.sqlite")
+    assert 0 < len(kept) < 120
+    again = subprocess.run([*command, "--store", "s.sqlite", "--workers", "1"], **options)
+    assert again.returncode == 0, again.stderr
+    assert f"{120 - len(kept)} runs trained, {len(kept)} were in s.sqlite already" in " ".join(again.stderr.split())
+    assert kept.items() <= blobs(tmp_path / "s.sqlite").items()
