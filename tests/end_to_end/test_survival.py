@@ -83,6 +83,23 @@ def blobs(path):
         return {row[:2]: row[2:] for row in db.execute("select key, seed, data, checksum, metrics from results")}
 
 
+def pause(process, path):
+    """Stop a process that trains, not one that writes: it would keep all others out."""
+    while True:
+        process.send_signal(signal.SIGSTOP)
+        with closing(sqlite3.connect(path, timeout=0.2)) as db:
+            try:
+                db.execute("begin immediate")
+            except sqlite3.OperationalError:
+                process.send_signal(signal.SIGCONT)
+            else:
+                claims = db.execute("select count(*) from claims").fetchone()[0]
+                db.rollback()
+                if claims:
+                    return
+                process.send_signal(signal.SIGCONT)
+
+
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     from uard.lab import runner
@@ -166,7 +183,7 @@ def test_two_processes_share_a_study(study, tmp_path, undisturbed):
 def test_what_a_killed_process_had_in_flight_is_taken_over_by_one_that_waits(study, tmp_path, undisturbed):
     first = study(workers=1)
     done(first)
-    first.send_signal(signal.SIGSTOP)
+    pause(first, tmp_path / "s.sqlite")
     second = study(workers=1)
     with closing(Store(tmp_path / "s.sqlite")) as store:
         while store.count()[1] < JOBS - 1:
