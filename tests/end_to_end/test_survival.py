@@ -111,7 +111,7 @@ def undisturbed(tmp_path_factory):
 
 
 def test_killed_at_random_points_a_study_ends_as_if_nothing_had_happened(study, tmp_path, undisturbed):
-    chance, kills, round_, lost_at_most = random.Random(20261122), 0, 0, 0
+    chance, kills, round_, again = random.Random(20261122), 0, 0, 0
     while kills < KILLS:
         round_ += 1
         name, ended, before = f"{round_}.sqlite", False, {}
@@ -141,8 +141,8 @@ def test_killed_at_random_points_a_study_ends_as_if_nothing_had_happened(study, 
         assert before == undisturbed
         assert began == JOBS + lost
         assert all(len(set(tokens)) == len(tokens) for tokens in attempts.values())
-        lost_at_most += lost
-    print(f"{kills} kills, {round_} studies of {JOBS} seeds, {lost_at_most} seeds in flight trained again")
+        again += lost
+        print(f"{kills} kills, {round_} studies of {JOBS} seeds, {again} seeds in flight trained again", flush=True)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])

@@ -38,7 +38,7 @@ class Forecast:
     A cell's cost (environment steps, weighted by the kind of agent) is multiplied by the seconds per cost of its own
     program; of agents of its kind if its program has not run yet; of everything if its kind has not. What compiling a
     program takes is learnt from first batches, and added for every program that is still to come. Nothing is said
-    before the first batch is done.
+    before a program has run twice, or three have run: who has seen one batch does not know what of it was compiling.
     """
 
     def __init__(self, queue: Sequence[Sequence[Job]], workers: int, shape: Shape):
@@ -92,7 +92,8 @@ class Forecast:
 
         It is never less than the longest batch still needs, however many workers there are.
         """
-        if not any(p.batches for p in self._programs.values()):
+        batches = [p.batches for p in self._programs.values()]
+        if max(batches, default=0) < 2 and sum(batches) < 3:
             return None
         compiling = self._compiling()
         pieces, longest, count = 0.0, 0.0, len(self._busy)

@@ -469,11 +469,12 @@ def _spread(queue: list[list[Job]], workers: int, folder: Path | None, claim: Cl
             return
         ours, theirs = context.Pipe()
         process = context.Process(target=_work, args=(theirs, core), daemon=True)
+        processes[ours], compiled[ours] = (process, core), mine  # before an interrupt can come between
         _start_deaf(process)
         theirs.close()
-        processes[ours], compiled[ours] = (process, core), mine
         give(ours, work)
 
+    complete = False
     try:
         for i in range(min(workers, len(queue))):
             start(cores[i % len(cores)] if cores else None)
@@ -493,12 +494,15 @@ def _spread(queue: list[list[Job]], workers: int, folder: Path | None, claim: Cl
                 else:
                     give(pipe, take(compiled[pipe]))
                 yield batch, answer
+        complete = True
     finally:
-        for pipe, (process, _) in processes.items():
-            pipe.close()
-            if busy:
+        begun = [process for process, _ in processes.values() if process.pid is not None]
+        for process in begun:
+            if not complete:
                 process.kill()
-        for process, _ in processes.values():
+        for pipe in processes:
+            pipe.close()
+        for process in begun:
             process.join()
     for batch in local:
         yield batch, _attempt(lambda batch=batch: (batch, folder))
