@@ -24,15 +24,44 @@ from uard.lab.store import Store
 KILLS = int(os.environ.get("UARD_KILLS", "8"))
 JOBS, WORKERS = 30, 2
 DRIVER = """
-import sys
+import signal, sys
 from uard.lab import runner
 from uard.lab.store import Store
 from test_survival import walks
 
 if __name__ == "__main__":
     from uard import cli
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with cli._terminable():
         print(runner.run(walks(), Store(sys.argv[1]), int(sys.argv[2]), lambda *x: print(*x, flush=True)), flush=True)
+"""
+
+# Starts processes that have imported everything: a hundred starts of Python would take longer than the test may.
+STARTER = """
+import os, signal, sys, warnings
+import jax
+from uard import cli
+from uard.lab import finish, runner
+from uard.lab.store import Store
+from uard.training import fused
+from test_survival import walks
+
+warnings.simplefilter("ignore", RuntimeWarning)  # of os.fork: nothing has been computed here
+for line in sys.stdin:
+    pid = os.fork()
+    if not pid:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        code = 1
+        try:
+            with cli._terminable(), open("progress", "a") as progress:
+                runner.run(walks(), Store(line.strip()), 1, lambda *x: print(*x, file=progress, flush=True))
+            code = 0
+        except KeyboardInterrupt:
+            code = 130
+        finally:
+            os._exit(code)
+    print(pid, flush=True)
+    print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
 """
 
 
@@ -46,12 +75,13 @@ def walks(n=JOBS):
 def study(tmp_path):
     """Starts the study in a process group of its own."""
     (tmp_path / "driver.py").write_text(DRIVER)
+    (tmp_path / "starter.py").write_text(STARTER)
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     started = []
 
-    def start(store="s.sqlite", workers=WORKERS, **options):
+    def start(*arguments, script="driver.py", **options):
         process = subprocess.Popen(
-            [sys.executable, "driver.py", store, str(workers)],
+            [sys.executable, script, *map(str, arguments or ("s.sqlite", WORKERS))],
             cwd=tmp_path,
             env=os.environ | {"PYTHONPATH": path},
             stdout=subprocess.PIPE,
@@ -111,43 +141,53 @@ def undisturbed(tmp_path_factory):
 
 
 def test_killed_at_random_points_a_study_ends_as_if_nothing_had_happened(study, tmp_path, undisturbed):
-    chance, kills, round_, again = random.Random(20261122), 0, 0, 0
+    starter = study(script="starter.py", stdin=subprocess.PIPE)
+    chance, kills, rounds, again, progress = random.Random(20261122), 0, 0, 0, tmp_path / "progress"
+    progress.touch()
+
+    def lines():
+        return progress.read_text().count("\n")
+
     while kills < KILLS:
-        round_ += 1
-        name, ended, before = f"{round_}.sqlite", False, {}
-        began, lost = 0, 0
-        while not ended:
-            process = study(name)
-            try:
-                process.communicate(timeout=chance.uniform(0, 9) if kills < KILLS else 300)
-                assert process.returncode == 0
-                ended = True
-            except subprocess.TimeoutExpired:
-                how = chance.choice([signal.SIGKILL] * 3 + [signal.SIGTERM, signal.SIGINT])
-                os.killpg(process.pid, how)
-                process.communicate(timeout=60)
-                kills += 1
-            if not (tmp_path / name).exists():
+        rounds += 1
+        path, code, before, began, lost = tmp_path / f"{rounds}.sqlite", None, {}, 0, 0
+        while code != 0:
+            starter.stdin.write(f"{path}\n")
+            starter.stdin.flush()
+            pid, seen = int(starter.stdout.readline()), lines()
+            if kills < KILLS:
+                seeds, deadline = chance.randrange(5), time.monotonic() + 60
+                while (
+                    lines() < min(seen + seeds, JOBS) and Path(f"/proc/{pid}").exists() and time.monotonic() < deadline
+                ):
+                    time.sleep(0.005)
+                time.sleep(chance.uniform(0, 0.5))
+                os.kill(pid, chance.choice([signal.SIGKILL] * 3 + [signal.SIGTERM, signal.SIGINT]))
+            code = int(starter.stdout.readline())
+            assert code in (0, 130, -signal.SIGKILL)
+            kills += code != 0
+            if not path.exists():
                 continue
-            with closing(Store(tmp_path / name)) as store:
-                attempts, after = store.attempts(), blobs(tmp_path / name)
-                now = sum(map(len, attempts.values()))
-                assert before.items() <= after.items(), "what was finished stays as it was"
-                assert {k: v for k, v in undisturbed.items() if k in after} == after
-                finished, tried = len(after) - len(before), now - began
-                assert tried - finished <= WORKERS, "only what was in flight is lost"
+            with closing(Store(path)) as store:
+                attempts, after = store.attempts(), blobs(path)
                 assert store.quarantined() == []
-            lost, began, before = lost + tried - finished, now, after
+            assert before.items() <= after.items(), "what was finished stays as it was"
+            assert {k: v for k, v in undisturbed.items() if k in after} == after
+            tried, finished = sum(map(len, attempts.values())) - began, len(after) - len(before)
+            assert 0 <= tried - finished <= 1, "only what was in flight is lost"
+            began, lost, before = began + tried, lost + tried - finished, after
         assert before == undisturbed
         assert began == JOBS + lost
         assert all(len(set(tokens)) == len(tokens) for tokens in attempts.values())
         again += lost
-        print(f"{kills} kills, {round_} studies of {JOBS} seeds, {again} seeds in flight trained again", flush=True)
+        print(f"{kills} kills, {rounds} studies of {JOBS} seeds, {again} seeds in flight trained again", flush=True)
+    starter.stdin.close()
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_signal_ends_the_real_program_at_once_with_its_code(tmp_path, number, code):
-    command = [sys.executable, "-c", "from uard.cli import main; main()", "reproduce", "scale", "--seeds", "40"]
+    program = "import signal; signal.signal(2, signal.default_int_handler); from uard.cli import main; main()"
+    command = [sys.executable, "-c", program, "reproduce", "scale", "--seeds", "40"]
     log = tmp_path / "log"
     process = subprocess.Popen(
         [*command, "--store", str(tmp_path / "s.sqlite"), "--workers", "2", "--log", str(log)],
@@ -170,7 +210,7 @@ def test_a_signal_ends_the_real_program_at_once_with_its_code(tmp_path, number, 
 
 
 def test_two_processes_share_a_study(study, tmp_path, undisturbed):
-    both = [study(workers=1), study(workers=1)]
+    both = [study("s.sqlite", 1), study("s.sqlite", 1)]
     answers = [p.communicate(timeout=120) for p in both]
     assert [(p.returncode, error) for p, (_, error) in zip(both, answers, strict=True)] == [(0, ""), (0, "")]
     assert sum(int(out.split()[-1]) for out, _ in answers) == JOBS
@@ -181,10 +221,10 @@ def test_two_processes_share_a_study(study, tmp_path, undisturbed):
 
 
 def test_what_a_killed_process_had_in_flight_is_taken_over_by_one_that_waits(study, tmp_path, undisturbed):
-    first = study(workers=1)
+    first = study("s.sqlite", 1)
     done(first)
     pause(first, tmp_path / "s.sqlite")
-    second = study(workers=1)
+    second = study("s.sqlite", 1)
     with closing(Store(tmp_path / "s.sqlite")) as store:
         while store.count()[1] < JOBS - 1:
             assert second.poll() is None
