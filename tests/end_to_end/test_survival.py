@@ -181,7 +181,6 @@ def test_killed_at_random_points_a_study_ends_as_if_nothing_had_happened(study, 
         assert all(len(set(tokens)) == len(tokens) for tokens in attempts.values())
         again += lost
         print(f"{kills} kills, {rounds} studies of {JOBS} seeds, {again} seeds in flight trained again", flush=True)
-    starter.stdin.close()
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])

@@ -3,7 +3,7 @@ import random
 
 import pytest
 
-from uard.agents.value import DQN
+from uard.agents.value import DeepQ
 from uard.envs.trapgrid import TrapGrid
 from uard.lab.cell import Cell
 from uard.lab.forecast import Forecast
@@ -17,12 +17,12 @@ def jobs():
     """Short and long cells, several programs, two kinds of agents."""
     short = [Cell(TrapGrid(6), named(m), episodes=100 + n) for m in ("raw", "uard") for n in range(10)]
     long = [Cell(TrapGrid(10), named(m), episodes=1000 + n) for m in ("raw", "uard") for n in range(4)]
-    deep = [Cell(TrapGrid(6), named("raw"), DQN(), episodes=n) for n in (10, 20, 30)]
+    deep = [Cell(TrapGrid(6), named("raw"), DeepQ(), episodes=n) for n in (10, 20, 30)]
     return [(cell, seed) for cell in (*short, *long, *deep) for seed in range(2)]
 
 
 def kind(cell):
-    return "dqn" if isinstance(cell.agent, DQN) else cell.mitigation
+    return "dqn" if isinstance(cell.agent, DeepQ) else cell.mitigation
 
 
 def shape(cell):
@@ -63,12 +63,10 @@ def simulated(workers, noise=0.1):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_what_remains_is_foretold_better_than_by_a_plain_average(workers):
     told = [x for x in simulated(workers) if x[1] is not None]
-    half = [x for x in told if x[0] < told[0][0] / 2 and x[0] > 0]
-    assert len(half) > 5
-    ours = [abs(said - true) for true, said, _ in half]
-    plain = [abs(average - true) for true, _, average in half]
-    assert max(ours) < 0.35 * told[0][0]
-    assert sum(ours) < 0.5 * sum(plain)
+    assert len(told) > 20
+    assert sum(abs(said - true) for true, said, _ in told) < 0.5 * sum(abs(plain - true) for true, _, plain in told)
+    if workers == 1:  # every program has run: nothing is left to be compiled
+        assert all(said == pytest.approx(true, rel=0.1, abs=0.1) for true, said, _ in told[len(told) // 2 :])
     assert told[-1][:2] == (0.0, 0.0)
 
 
