@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from uard import __version__
 
@@ -25,6 +27,21 @@ except ModuleNotFoundError:  # the core is installed without its laboratory
     sys.exit(_NEEDS_LAB)
 
 _Pairs = UseAppendAction[tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Watch:
+    """What to leave for those who watch."""
+
+    tensorboard: str | None = None
+    """Write TensorBoard event files of every finished seed below this folder."""
+    log: str | None = None
+    """Append what happens to this file."""
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """The least that is worth a line there."""
+
+
+_Watch = Annotated[Watch, arg(name="")]
 
 
 @dataclass(frozen=True)
@@ -66,6 +83,7 @@ class Run:
     """Write one JSON object to this file; - for standard output."""
     store: str | None = None
     """Keep finished seeds in this file and do not train them again."""
+    watch: _Watch = Watch()
 
 
 @dataclass(frozen=True)
@@ -92,6 +110,9 @@ class Reproduce:
     """Of the Ray cluster's head, host:port, or auto; if left out, Ray is started on this machine."""
     gpus: float = 0.0
     """GPUs of a Ray task, a fraction perhaps."""
+    failed: bool = False
+    """Only what failed when it was last tried."""
+    watch: _Watch = Watch()
 
 
 @dataclass(frozen=True)
@@ -108,6 +129,35 @@ class Ledger:
     """Where finished seeds are kept; what is missing is trained first."""
     workers: int | None = None
     """Processes; one per core if left out."""
+    watch: _Watch = Watch()
+
+
+@dataclass(frozen=True)
+class Status:
+    """Say how far studies are, who is at work on them, and what failed; changes nothing."""
+
+    studies: Positional[tuple[str, ...]] = ()
+    """Which studies or groups of them; those of which the store knows anything if left out."""
+    seeds: int | None = None
+    """Seeds that every cell should have; as many as the store knows of any cell of a study if left out."""
+    errors: bool = False
+    """Print the tracebacks of what failed."""
+    json: str | None = None
+    """Write one JSON object to this file; - for standard output."""
+    store: str = DEFAULT_STORE
+    """Where finished seeds are kept."""
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Say whether two stores agree: bit by bit, or but for the noise over seeds. Exit code 1 if they do not."""
+
+    store_a: Positional[str]
+    """One store."""
+    store_b: Positional[str]
+    """The other: of another machine, version, engine."""
+    json: str | None = None
+    """Write one JSON object to this file; - for standard output."""
 
 
 @dataclass(frozen=True)
@@ -172,12 +222,21 @@ Command = (
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[BestOfN, tyro.conf.subcommand("best-of-n")]
     | Annotated[Leaderboard, tyro.conf.subcommand("leaderboard")]
+    | Annotated[Status, tyro.conf.subcommand("status")]
+    | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[List, tyro.conf.subcommand("list")]
 )
 
 
+class _TerminatedError(KeyboardInterrupt):
+    """SIGTERM, which ends a study as an interrupt does."""
+
+
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run the command line. Exit code 2 for bad input, 1 for a failed run or a danger, 130 for an interrupt."""
+    """Run the command line.
+
+    Exit code 2 for bad input, 1 for failed runs, a danger or a difference, 130 for an interrupt, 143 for SIGTERM.
+    """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments in (["--version"], ["-V"]):
         print(f"uard {__version__}")
@@ -195,16 +254,57 @@ def main(argv: Sequence[str] | None = None) -> None:
     except ModuleNotFoundError as error:
         sys.exit(f"{_NEEDS_LAB} ({error})")
     try:
-        _BODIES[type(command)](command, console)
+        with _terminable():
+            _BODIES[type(command)](command, console)
     except (ClusterError, InvalidValueError, StoreError) as error:
         console.print(f"[red]error:[/red] {_escape(str(error))}", soft_wrap=True)
         sys.exit(2)
     except StudyFailedError as error:
         console.print(f"[red]error:[/red] {_escape(str(error))}", soft_wrap=True)
+        _print_failures(error, command, console)
         sys.exit(1)
-    except KeyboardInterrupt:
-        console.print("interrupted; every finished cell is stored, the same command goes on from there")
-        sys.exit(130)
+    except KeyboardInterrupt as stop:
+        what, code = ("terminated", 143) if isinstance(stop, _TerminatedError) else ("interrupted", 130)
+        console.print(f"{what}; every finished cell is stored, the same command goes on from there")
+        sys.exit(code)
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM end the block as an interrupt does, once; a second one would only disturb the ending."""
+
+    def stop(number: int, _: object) -> None:
+        signal.signal(number, signal.SIG_IGN)
+        raise _TerminatedError
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _print_failures(error: Any, command: Any, console: Console) -> None:
+    """Say which cells failed, one line each, and how to run only those."""
+    from uard import studies
+    from uard.reporting.status import titles
+
+    names = titles(studies.find(command.studies)) if isinstance(command, Reproduce) else {}
+    cells: dict[tuple[str, str], list[int]] = {}
+    for failure in error.failures:
+        why = failure.error.strip().rpartition("\n")[2]
+        for cell, seed in failure.jobs:
+            cells.setdefault((names.get(cell.key) or str(cell), why), []).append(seed)
+    for (name, why), seeds in list(cells.items())[:_LINES]:
+        console.print(f"failed: {_escape(name)}, seeds {sorted(seeds)}: {_escape(why)}", soft_wrap=True)
+    if len(cells) > _LINES:
+        console.print(f"and {len(cells) - _LINES} cells more")
+    if isinstance(command, Reproduce):
+        chosen = "".join(f"{name} " for name in command.studies)
+        where = f"--store {command.store}"
+        again = f"uard reproduce {chosen}--seeds {command.seeds} {where} --failed"
+        errors = f"uard status {chosen}{where} --errors"
+        console.print(f"only these again: {_escape(again)}\ntheir tracebacks: {_escape(errors)}", soft_wrap=True)
 
 
 def _escape(text: str) -> str:
@@ -252,7 +352,8 @@ def _run(command: Run, console: Console) -> None:
     store = Store(command.store or ":memory:")
     seeds = range(command.seeds)
     started = time.perf_counter()
-    trained = _train([(cell, s) for s in seeds], store, console, f"training {len(seeds)} seeds")
+    what = f"training {len(seeds)} seeds"
+    trained = _train([(cell, s) for s in seeds], store, console, what, command.watch)
     seconds = time.perf_counter() - started
     results = results_of(cell, store, seeds)
     metrics = summaries(results)
@@ -281,30 +382,77 @@ def _run(command: Run, console: Console) -> None:
         Console().print(table)
 
 
-def _train(jobs: Any, store: Any, console: Console, what: str, workers: int | None = None, engine: Any = None) -> int:
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+def _train(
+    jobs: Any,
+    store: Any,
+    console: Console,
+    what: str,
+    watch: Watch,
+    workers: int | None = None,
+    studies: Sequence[Any] = (),
+    engine: Any = None,
+) -> int:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from uard.lab import runner
+    from uard.reporting.status import duration, titles
 
+    events = None
+    if watch.tensorboard is not None:
+        from uard.reporting.tensorboard import Events
+
+        events = Events(watch.tensorboard, titles(studies))
+        events.catch_up(store, jobs)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        TimeRemainingColumn(),
+        TextColumn("{task.fields[left]}"),
     )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task(what, total=None)
-        return runner.run(
-            jobs, store, workers, lambda done, total: bar.update(task, completed=done, total=total), engine
-        )
+    with _logging(watch), Progress(*columns, console=console) as bar:
+        task = bar.add_task(what, total=None, left="")
+
+        def progress(done: int, total: int, left: float | None) -> None:
+            text = "" if left is None else f"about {duration(left)} left" if done < total else "done"
+            bar.update(task, completed=done, total=total, left=text)
+
+        trained = runner.run(jobs, store, workers, progress, events.write if events else None, engine)
+    if events:
+        events.catch_up(store, jobs)  # what other processes have trained
+    return trained
+
+
+@contextmanager
+def _logging(watch: Watch) -> Iterator[None]:
+    """Append to the file what the library logs, as long as the block runs."""
+    import logging
+    import time
+
+    if watch.log is None:
+        yield
+        return
+    _check_writable("log", watch.log, Path(watch.log).parent)
+    try:
+        handler = logging.FileHandler(watch.log, encoding="utf-8")
+    except OSError as error:
+        raise _invalid("log", watch.log, f"a file that can be written ({error})") from None
+    form = logging.Formatter(f"%(asctime)s.%(msecs)03dZ {os.getpid()} %(levelname)s %(message)s", "%Y-%m-%dT%H:%M:%S")
+    form.converter = time.gmtime
+    handler.setFormatter(form)
+    logger = logging.getLogger("uard")
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(watch.log_level.upper())
+    try:
+        yield
+    except BaseException as error:
+        logger.error("ended by %s", type(error).__name__)
+        raise
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
+        handler.close()
 
 
 def _check_json(target: str | None) -> None:
@@ -335,9 +483,12 @@ def _write_json(data: Any, target: str, option: str = "json", indent: int | None
     if target == "-":
         print(text)
         return
+    half = Path(f"{target}.{os.getpid()}.part")  # what is at the target is whole at any time
     try:
-        Path(target).write_text(text + "\n", encoding="utf-8")
+        half.write_text(text + "\n", encoding="utf-8")
+        half.replace(target)
     except OSError as error:
+        half.unlink(missing_ok=True)
         raise _invalid(option, target, f"a file that can be written ({error})") from None
 
 
@@ -376,11 +527,20 @@ def _reproduce(command: Reproduce, console: Console) -> None:
     if command.report:
         _check_writable("report", command.report, Path(command.report))
     _check_json(command.extract)
+    for name in ("report", "extract"):
+        if command.failed and getattr(command, name) is not None:
+            raise _invalid(name, getattr(command, name), "left out with --failed, which runs a part only")
     store = Store(command.store)
     seeds = range(command.seeds)
-    jobs = [job for study in chosen for job in study.jobs(seeds)]
-    trained = _train(jobs, store, console, f"{len(chosen)} studies, {len(set(jobs))} runs", command.workers, engine)
-    console.print(f"{trained} runs trained, {len(set(jobs)) - trained} were in {command.store} already")
+    jobs = list(dict.fromkeys(job for study in chosen for job in study.jobs(seeds)))
+    if command.failed:
+        failures = store.failures()
+        jobs = [(cell, seed) for cell, seed in jobs if (cell.key, seed) in failures]
+    what = f"{len(chosen)} studies, {len(jobs)} runs"
+    trained = _train(jobs, store, console, what, command.watch, command.workers, chosen, engine)
+    console.print(f"{trained} runs trained, {len(jobs) - trained} were in {command.store} already")
+    if command.failed:
+        return
     if command.extract is not None:
         from uard.reporting import published
 
@@ -417,7 +577,7 @@ def _ledger(command: Ledger, console: Console) -> None:
     store = Store(command.store)
     seeds = range(command.seeds)
     jobs = [job for study in studies.grid() for job in study.jobs(seeds)]
-    _train(jobs, store, console, "what the ledger needs", command.workers)
+    _train(jobs, store, console, "what the ledger needs", command.watch, command.workers, studies.grid())
     evidence = Evidence(store, seeds, studies.grid())
     entries = [e for e in ledger.entries(evidence) if not command.claims or e.claim in command.claims]
     if command.json is not None:
@@ -495,6 +655,80 @@ def _leaderboard(command: Leaderboard, console: Console) -> None:
     console.print(f"leaderboard: {leaderboard.write(Path(command.out), Store(command.store))}", soft_wrap=True)
 
 
+def _status(command: Status, console: Console) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from uard import _checks, studies
+    from uard.lab.store import Store
+    from uard.reporting import status
+
+    if command.seeds is not None:
+        _checks.whole("seeds", command.seeds, low=1, high=100_000)
+    _check_json(command.json)
+    chosen = studies.find(command.studies) if command.studies else studies.every()
+    with closing(Store(command.store, readonly=True)) as store:
+        found = status.status(store, chosen, command.seeds, every=bool(command.studies))
+    if command.json is not None:
+        _write_json(status.as_data(found), command.json)
+    if command.json == "-":
+        return
+    out = Console(highlight=False)
+    out.print(f"{_escape(command.store)}: {found.cells} cells, {found.seeds} seeds", soft_wrap=True)
+    for line in status.lines(found.runs):
+        out.print(_escape(line), soft_wrap=True)
+    columns = ("study", "seeds a cell", "finished", "in work", "failed", "missing", "last finished (UTC)")
+    table = Table(*columns)
+    for s in found.studies:
+        numbers = (s.seeds, s.finished, s.claimed, s.failed, s.missing)
+        table.add_row(s.name, *map(str, numbers), status.clock(s.last) if s.last else "-")
+    out.print(table)
+    for failure in found.failures:
+        what = failure.why.traceback if command.errors else failure.why.error
+        when = status.clock(failure.why.created)
+        out.print(_escape(f"failed {when}: {failure.title}, seeds {list(failure.seeds)}: {what}"), soft_wrap=True)
+
+
+def _compare(command: Compare, console: Console) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from uard import studies
+    from uard.lab.store import Store
+    from uard.reporting import compare
+    from uard.reporting.status import titles
+
+    _check_json(command.json)
+    with (
+        closing(Store(command.store_a, readonly=True)) as a,
+        closing(Store(command.store_b, readonly=True)) as b,
+    ):
+        found = compare.compare(a, b)
+    if command.json is not None:
+        _write_json(compare.as_data(found), command.json)
+    if command.json != "-":
+        out = Console(highlight=False)
+        differing = sorted((c for c in found.cells if c.effects), key=lambda c: c.effects[0].p)
+        if differing:
+            names = titles(studies.every())
+            table = Table("cell", "seeds", "identical", "metric", "B - A", "in seed sd", "p, corrected")
+            rows = [("all cells that differ", None, e) for e in found.everywhere[:1]]
+            rows += [(names.get(c.key) or compare.title(c.config), c, c.effects[0]) for c in differing[:_LINES]]
+            for name, c, e in rows:
+                counts = (str(len(c.seeds)), str(len(c.identical))) if c else ("", "")
+                effect = "none" if e.effect is None else f"{e.effect:+.2f}"
+                difference = f"{e.difference:+.4g}" if c else ""
+                style = "red" if e.differs else None
+                table.add_row(_escape(name), *counts, e.metric, difference, effect, f"{e.p:.3g}", style=style)
+            out.print(table)
+            if len(differing) > _LINES:
+                out.print(f"and {len(differing) - _LINES} cells more that differ; --json has them all")
+        for line in compare.lines(found):
+            out.print(_escape(line), soft_wrap=True)
+    if found.differs:
+        sys.exit(1)
+
+
 def _list(command: List, console: Console) -> None:
     from rich.console import Console
     from rich.table import Table
@@ -539,10 +773,13 @@ def _warn_of_broken(console: Console) -> None:
             console.print(f"[yellow]warning:[/yellow] {_escape(str(error))}", soft_wrap=True)
 
 
+_LINES = 20
 _BODIES: dict[type, Callable[[Any, Console], None]] = {
     Run: _run,
     Reproduce: _reproduce,
     Ledger: _ledger,
+    Status: _status,
+    Compare: _compare,
     Doctor: _doctor,
     BestOfN: _best_of_n,
     Leaderboard: _leaderboard,

@@ -7,13 +7,16 @@ import sys
 import time
 from contextlib import closing
 from pathlib import Path
+from unittest.mock import ANY
 
+import numpy as np
 import pytest
 
 from uard import __version__, cli, mitigation, studies
 from uard.envs.panels import PANELS
-from uard.lab import names
-from uard.lab.result import METRICS
+from uard.lab import names, runner
+from uard.lab.result import METRICS, Result
+from uard.lab.store import Store
 
 UARD = str(Path(sys.executable).parent / "uard")
 RUN = ["run", "TrapGrid", "--set", "size=5", "--set", "traps=[[2,2]]", "--episodes", "60", "--seeds", "2"]
@@ -43,6 +46,9 @@ def test_version():
         (("run",), ("--set", "--set-mitigation", "--noise-fraction", "--json", "Who rates")),
         (("reproduce",), ("--report", "--store", "--workers", "--seeds")),
         (("ledger",), ("--json", "J5 F3")),
+        (("reproduce",), ("--failed", "--tensorboard", "--log", "--log-level")),
+        (("status",), ("--store", "--seeds", "--errors", "--json")),
+        (("compare",), ("--json", "Exit code 1")),
         (("list",), ("--help",)),
     ],
 )
@@ -138,6 +144,15 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
         ("reproduce control --report out", "report = 'out': must be left out unless all grid studies are run"),
         ("reproduce --report file/out", "report = 'file/out': must be in a folder that can be written"),
         ("reproduce control --store file", "store = 'file': must be a result store"),
+        ("reproduce control --failed --extract x.json", "extract = 'x.json': must be left out with --failed"),
+        ("reproduce control --log file/log", "log = 'file/log': must be in a folder that can be written"),
+        ("reproduce control --tensorboard file/tb", "tensorboard = 'file/tb': must be in a folder that can be written"),
+        ("status --store none.sqlite", "store = 'none.sqlite': must be a result store, but there is no such file"),
+        ("status --store file", "store = 'file': must be a result store"),
+        ("status contrl --store file", "study = 'contrl': must be one of *did you mean 'control'?"),
+        ("status --seeds 0", "seeds = 0: must be"),
+        ("compare none.sqlite file", "store = 'none.sqlite': must be a result store, but there is no such file"),
+        ("compare file none.sqlite", "store = 'file': must be a result store"),
         ("ledger J99", "claim = 'J99': must be one of F2, "),
         ("ledger --seeds 1", "seeds = 1: must be"),
     ],
@@ -155,6 +170,7 @@ def test_silly_input_is_refused_in_one_line(arguments, message, tmp_path, monkey
     assert error.startswith(f"error: {start}")
     assert hint in error
     assert (tmp_path / "file").read_text() == "this is mine, and no database\n"
+    assert not (tmp_path / "none.sqlite").exists()
 
 
 @pytest.mark.parametrize(
@@ -179,12 +195,69 @@ def test_a_run_that_diverges_ends_with_1(capsys):
 
 def test_reproduce_trains_nothing_twice(tmp_path):
     command = ("reproduce", "control", "--seeds", "2", "--workers", "1", "--store", tmp_path / "s.sqlite")
-    first, again = uard(*command), uard(*command)
+    first, again = uard(*command, "--tensorboard", tmp_path / "tb", "--log", tmp_path / "log"), uard(*command)
     assert (first.returncode, again.returncode) == (0, 0)
     assert f"8 runs trained, 0 were in {tmp_path}/s.sqlite already" in " ".join(first.stderr.split())
     assert f"0 runs trained, 8 were in {tmp_path}/s.sqlite already" in " ".join(again.stderr.split())
     assert first.stdout == again.stdout
     assert "A random walker" in first.stdout
+    assert len(list((tmp_path / "tb").glob("control_size_*/seed-[01]/events.*"))) == 8
+    assert "INFO 8 of 8 seeds done" in (tmp_path / "log").read_text()
+
+
+def test_what_failed_is_named_and_can_be_run_alone(tmp_path, monkeypatch, capsys):
+    """The first two cells raise at first, and then no more."""
+    monkeypatch.chdir(tmp_path)
+    study, train, bad = studies.find(("control",))[0], runner._train_lanes, []
+    bad += [r.cell for r in study.rows[:2]]
+
+    def picky(batch, folder=None):
+        if any(cell in bad for cell, _ in batch):
+            raise ValueError("not [this] one")
+        return train(batch, folder)
+
+    monkeypatch.setattr(runner, "_train_lanes", picky)
+    command = ["reproduce", "control", "--seeds", "2", "--workers", "1", "--store", "s.sqlite"]
+    for _ in range(2):
+        with pytest.raises(SystemExit) as stopped:
+            cli.main(command)
+        out, error = capsys.readouterr()
+        assert (stopped.value.code, out) == (1, "")
+        assert "4 seeds failed, the rest is stored" in error
+        assert "failed: control: size 6, horizon 40, seeds [0, 1]: ValueError: not [this] one" in error
+        assert "only these again: uard reproduce control --seeds 2 --store s.sqlite --failed" in error
+        assert "their tracebacks: uard status control --store s.sqlite --errors" in error
+    cli.main(["status", "control", "--store", "s.sqlite", "--errors", "--json", "status.json"])
+    out, _ = capsys.readouterr()
+    assert "Traceback" in out
+    assert json.loads((tmp_path / "status.json").read_text())["studies"] == [
+        {"name": "control", "seeds": 2, "finished": 4, "claimed": 0, "failed": 4, "missing": 0, "last": ANY}
+    ]
+    bad.clear()
+    cli.main([*command, "--failed"])
+    out, error = capsys.readouterr()
+    assert (out, "4 runs trained, 0 were in s.sqlite already" in error) == ("", True)
+    cli.main(["status", "--store", "s.sqlite"])
+    assert "control" in capsys.readouterr().out
+
+
+def test_compare_says_whether_two_stores_agree(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    cell = studies.find(("control",))[0].rows[0].cell
+    for name, shift in (("a", 0.0), ("b", 0.0), ("c", 5.0)):
+        with closing(Store(f"{name}.sqlite")) as store:
+            rng = np.random.default_rng(0)
+            logs = [rng.normal(10 + shift * (i % 2), 1, (3, 6)).astype(np.float32) for i in range(1, 17, 2)]
+            store.put([(cell, s, Result(log, 30, np.zeros(2, np.int32), {})) for s, log in enumerate(logs)])
+    cli.main(["compare", "a.sqlite", "b.sqlite"])
+    assert "verdict: identical" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(["compare", "a.sqlite", "c.sqlite", "--json", "c.json"])
+    out, error = capsys.readouterr()
+    assert (stopped.value.code, error) == (1, "")
+    assert "verdict: differ" in out
+    found = json.loads((tmp_path / "c.json").read_text())
+    assert (found["differs"], found["identical"], found["cells"][0]["key"]) == (True, False, cell.key)
 
 
 def test_an_interrupt_is_no_accident(tmp_path):

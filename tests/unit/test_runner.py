@@ -80,7 +80,7 @@ def good(users):
 def calm(good):
     """Everything good, trained in this process."""
     store, seen = Store(":memory:"), []
-    trained = run([*good, *good], store, workers=0, progress=lambda *x: seen.append(x))
+    trained = run([*good, *good], store, workers=0, progress=lambda *x: seen.append(x[:2]))
     yield SimpleNamespace(store=store, trained=trained, seen=seen)
     store.close()
 
@@ -103,7 +103,7 @@ def wreck(users, good):
     every, local = [job for jobs in bad.values() for job in jobs], [(cell(Local()), 0)]
     store, seen = Store(":memory:"), []
     with pytest.raises(StudyFailedError) as caught:
-        run([*bad["dies"], *every, *good, *local], store, 2, lambda *x: seen.append(x))
+        run([*bad["dies"], *every, *good, *local], store, 2, lambda *x: seen.append(x[:2]))
     yield SimpleNamespace(store=store, error=caught.value, bad=bad, every=every, local=local, seen=seen)
     store.close()
 
@@ -245,7 +245,7 @@ from test_runner import walks
 
 if __name__ == "__main__":
     try:
-        runner.run(walks(), Store(sys.argv[1]), 2, lambda done, total: print(done, flush=True))
+        runner.run(walks(), Store(sys.argv[1]), 2, lambda done, *_: print(done, flush=True))
     except KeyboardInterrupt:
         sys.exit(130)
 """
@@ -287,7 +287,12 @@ def test_an_interrupt_loses_nothing_that_was_finished(tmp_path):
 
 def test_every_core_is_used_if_nothing_is_said(monkeypatch):
     asked = []
-    monkeypatch.setattr(runner, "_spread", lambda queue, workers, _: asked.append((len(queue), workers)) or [])
+
+    def spread(queue, workers, *_):
+        asked.append((len(queue), workers))
+        yield from ()
+
+    monkeypatch.setattr(runner, "_spread", spread)
     store = Store(":memory:")
     run([(cell(named("raw"), episodes=n), 0) for n in (1, 2)], store)
     store.close()

@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -136,9 +136,11 @@ def _settled(name: str, value: Any) -> Any:
     """
     if _checks.is_frozen(value):
         changes = {}
-        for f in dataclasses.fields(value):
+        for f in _fields(type(value)):
             old = getattr(value, f.name)
             new = _settled(f"{name}.{f.name}", old)
+            if new is old and type(new) is not int:
+                continue
             if f.type in (float, "float") and type(new) is int:
                 new = float(new)
             if type(new) is not type(old) or repr(new) != repr(old):
@@ -150,18 +152,25 @@ def _settled(name: str, value: Any) -> Any:
         return tuple(_settled(f"{name}[{i}]", v) for i, v in enumerate(value))
     if isinstance(value, float):
         _checks.number(name, value)
-        return value + 0.0
+        return value if value else 0.0
     if not (value is None or isinstance(value, bool | int | str)):
         allowed = "a number, text, true, false, none, or a tuple or frozen dataclass of these"
         raise _checks.InvalidValueError(name, value, allowed)
     return value
 
 
+@cache
+def _fields(cls: type) -> tuple[dataclasses.Field[Any], ...]:
+    return dataclasses.fields(cls)
+
+
 def plain(value: Any) -> Any:
     """Turn (nested) dataclasses into dictionaries that name their class."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         cls = type(value)
-        fields = {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        fields = {f.name: plain(getattr(value, f.name)) for f in _fields(cls)}
         return {"class": f"{cls.__module__}.{cls.__qualname__}", **fields}
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]

@@ -1,16 +1,24 @@
-"""Runs what is missing of some cells, on all cores, and stores every batch as soon as it is done."""
+"""Runs what is missing of some cells, on all cores, and stores every batch as soon as it is done.
+
+A batch is claimed in the store before it is trained, so that several processes share the work on one store, and what a
+killed one had in flight is trained by the next.
+"""
 
 from __future__ import annotations
 
+import logging
 import multiprocessing as mp
 import os
 import pickle
 import signal
+import threading
+import time
 import traceback
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -23,15 +31,22 @@ from uard.envs.spec import Tables
 from uard.envs.tabular import MIN_STATES
 from uard.feedback.learned import RatingModel
 from uard.feedback.transitions import TransitionModel
-from uard.lab.cell import Cell
+from uard.lab.cell import Cell, plain
+from uard.lab.claims import BEAT, Owner
+from uard.lab.forecast import Forecast
 from uard.lab.result import DivergedError, Result
-from uard.lab.store import Store
+from uard.lab.store import FailedSeed, Store, StoreError, give_sign
+
+log = logging.getLogger(__name__)
 
 BATCH = 64  # lanes trained by one call; about half a second of work
 DEEP_BATCH = 5  # the same for deep agents; some ten seconds
 
 Job = tuple[Cell, int]
-Progress = Callable[[int, int], None]
+Progress = Callable[[int, int, float | None], None]
+Stored = Callable[[Sequence[tuple[Cell, int, Result]]], None]
+Claim = Callable[[list[Job]], list[Job]]
+POLL = 0.5  # seconds between two looks at what other processes have done
 
 
 @dataclass(frozen=True)
@@ -53,9 +68,9 @@ class StudyFailedError(RuntimeError):
         self.failures = tuple(failures)
 
 
-def shape_of(cell: Cell) -> tuple[Any, ...]:
-    """Cells with equal shapes are likely to share a compiled program and to take equally long."""
-    from uard.lab.cell import plain
+@lru_cache(maxsize=50_000)
+def shape_of(cell: Cell) -> tuple[Any, int]:
+    """Return program and cost: equal programs are likely to share a compiled one, and cost is how long a seed takes."""
 
     def structure(value: Any) -> Any:
         if isinstance(value, dict):
@@ -184,19 +199,24 @@ def run(
     store: Store,
     workers: int | None = None,
     progress: Progress | None = None,
+    stored: Stored | None = None,
     engine: Engine | None = None,
 ) -> int:
-    """Train the jobs that are not in the store yet; return how many that were.
+    """Train the jobs that are not in the store yet; return how many of them this process has trained.
+
+    What another process is training on the same store is waited for, and taken over if that one dies.
 
     Args:
         jobs: (cell, seed) pairs; doubles are trained once.
         store: Receives every finished batch at once, so an interrupt loses at most what is in flight.
         workers: Processes, one per core if left out; up to 1 trains in this one.
-        progress: Called with (finished, to do) after every batch.
+        progress: Called with (finished, to do, seconds that remain or None) after every batch.
+        stored: Called with every batch's results once they are safe.
         engine: What trains the batches instead of processes on this machine, such as ``uard.lab.cluster.Ray``.
 
     Raises:
-        StudyFailedError: some jobs raised; all others are stored.
+        StudyFailedError: some jobs raised; all others are stored, and the store says why. Each is tried once.
+        StoreError: the store cannot be written; what was finished before is safe.
     """
     wanted: dict[Cell, list[int]] = {}
     for cell, seed in jobs:
@@ -204,32 +224,131 @@ def run(
     todo = [(cell, seed) for cell, seeds in wanted.items() for seed in store.missing(cell, dict.fromkeys(seeds))]
     if not todo:
         return 0
-    queue = batches(todo)
     if workers is None:
         workers = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 64)
-    done, failures = 0, []
-    if progress:
-        progress(0, len(todo))
     folder = None if store.path == ":memory:" else Path(f"{store.path}-checkpoints")
-    if engine is not None:
-        outcomes = engine(queue, folder, list)
-    else:
-        outcomes = _here(queue, folder) if workers <= 1 or len(queue) == 1 else _spread(queue, workers, folder)
-    for batch, answer in outcomes:
-        answers = [answer] * len(batch) if isinstance(answer, str) else [_kept(a, store) for a in answer]
-        pairs = list(zip(batch, answers, strict=True))
-        store.put([(cell, seed, result) for (cell, seed), result in pairs if isinstance(result, Result)])
-        for (cell, seed), result in pairs:
-            if folder is not None and cell.steps is not None and isinstance(result, Result):
-                checkpoint_of(folder, cell, seed).unlink(missing_ok=True)
-        for error in dict.fromkeys(a for a in answers if isinstance(a, str)):
-            failures.append(Failure(tuple(job for job, a in pairs if a == error), error))
-        done += len(batch)
-        if progress:
-            progress(done, len(todo))
+    total, done, trained, failures = len(todo), 0, 0, []
+    known, forecast = store.failures(), Forecast(batches(todo), workers, shape_of)
+    log.info("%d of %d seeds are missing in %s; %d workers", total, len(jobs), store.path, workers)
+
+    with _at_work(store, total) as owner:
+        refused: list[Job] = []
+
+        def claim(batch: list[Job]) -> list[Job]:
+            mine = store.claim(batch, owner)
+            taken = set(mine)
+            others = [job for job in batch if job not in taken]
+            refused.extend(others)
+            forecast.drop(others)
+            if mine:
+                forecast.begin(mine, time.monotonic())
+            return mine
+
+        def tell() -> None:
+            left = forecast.remaining(time.monotonic()) if done < total else 0.0
+            store.report(owner, done, sum(len(f.jobs) for f in failures), left)
+            if progress:
+                progress(done, total, left)
+
+        def fail(lost: Sequence[Job], error: str) -> None:
+            failures.append(Failure(tuple(lost), error))
+            log.error("%d seeds failed, first %s:\n%s", len(lost), lost[0], error)
+
+        tell()
+        while todo:
+            queue = batches(todo)
+            if engine is not None:
+                outcomes = engine(queue, folder, claim)
+            elif workers <= 1 or len(queue) == 1:
+                outcomes = _here(queue, folder, claim)
+            else:
+                outcomes = _spread(queue, workers, folder, claim)
+            with closing(outcomes):
+                for batch, answer in outcomes:
+                    forecast.end(batch, time.monotonic())
+                    answers = [answer] * len(batch) if isinstance(answer, str) else [_kept(a, store) for a in answer]
+                    pairs = list(zip(batch, answers, strict=True))
+                    finished = [(cell, seed, result) for (cell, seed), result in pairs if isinstance(result, Result)]
+                    store.put(finished)
+                    for cell, seed, _ in finished:
+                        if folder is not None and cell.steps is not None:
+                            _forget(checkpoint_of(folder, cell, seed))
+                    for error in dict.fromkeys(a for a in answers if isinstance(a, str)):
+                        lost = [job for job, a in pairs if a == error]
+                        store.fail(lost, error, owner)
+                        fail(lost, error)
+                    if stored and finished:
+                        stored(finished)
+                    done, trained = done + len(batch), trained + len(finished)
+                    log.info("%d of %d seeds done", done, total)
+                    tell()
+            if refused:
+                log.info("waiting for %d seeds that other processes train", len(refused))
+            todo, refused = refused, []
+            while todo:
+                others, free, gone = _look(todo, store, known)
+                for error in dict.fromkeys(gone.values()):
+                    fail([job for job, e in gone.items() if e == error], error)
+                if len(others) + len(free) < len(todo):
+                    done = total - len(others) - len(free)
+                    tell()
+                todo = [*free, *others]
+                if free:
+                    log.warning("taking over %d seeds that nobody trains any more", len(free))
+                    break
+                if todo:
+                    time.sleep(POLL)
     if failures:
         raise StudyFailedError(failures)
-    return len(todo)
+    return trained
+
+
+@contextmanager
+def _at_work(store: Store, total: int) -> Iterator[Owner]:
+    """Be known in the store as long as the block runs; give back afterwards what was claimed and not finished."""
+    owner, stop = Owner.here(), threading.Event()
+    beats = threading.Thread(target=_beat, args=(store.path, owner, stop), daemon=True)
+    try:
+        store.begin(owner, total)
+        if store.path != ":memory:":
+            beats.start()
+        yield owner
+    finally:
+        stop.set()
+        owner.stop()
+        with suppress(StoreError):  # its claims are those of the dead then
+            store.end(owner)
+
+
+def _beat(path: str, owner: Owner, stop: threading.Event) -> None:
+    while not stop.wait(BEAT):
+        try:
+            give_sign(path, owner)
+        except StoreError as error:
+            log.warning("no sign of life could be given: %s", error)
+
+
+def _look(
+    jobs: list[Job], store: Store, known: dict[tuple[str, int], FailedSeed]
+) -> tuple[list[Job], list[Job], dict[Job, str]]:
+    """Return which jobs others still train, which nobody does, and which have failed elsewhere, and why."""
+    finished, failed, held = store.finished(), store.failures(), store.claimed()
+    others, free, gone = [], [], {}
+    for cell, seed in jobs:
+        place = cell.key, seed
+        if seed in finished.get(cell.key, ()):
+            continue
+        if place in failed and failed[place] != known.get(place):
+            gone[cell, seed] = failed[place].traceback
+        else:
+            (others if place in held else free).append((cell, seed))
+    return others, free, gone
+
+
+def _forget(checkpoint: Path) -> None:
+    """Remove the checkpoint of a run that is stored, and what killed processes have left of it."""
+    for file in checkpoint.parent.glob(f"{checkpoint.name}*"):
+        file.unlink(missing_ok=True)
 
 
 def _kept(answer: Result | DivergedError | str, store: Store) -> Result | str:
@@ -251,19 +370,34 @@ def _kept(answer: Result | DivergedError | str, store: Store) -> Result | str:
 
 # Per job its result, the divergence or a traceback; or one traceback for all of them.
 Answer = list[Result | DivergedError | str] | str
-Outcomes = Iterable[tuple[list[Job], Answer]]
-Claim = Callable[[list[Job]], list[Job]]  # of a batch, what of it is to be trained: called when it is handed out
+Outcomes = Generator[tuple[list[Job], Answer]]
 Engine = Callable[[list[list[Job]], Path | None, Claim], Outcomes]  # of batches (longest first), a folder, a claim
 
 
-def _here(queue: Iterable[list[Job]], folder: Path | None) -> Outcomes:
+def _here(queue: Iterable[list[Job]], folder: Path | None, claim: Claim) -> Outcomes:
     for batch in queue:
-        yield batch, _attempt(lambda batch=batch: (batch, folder))
+        if mine := claim(batch):
+            yield mine, _attempt(lambda mine=mine: (mine, folder))
 
 
 def _attempt(work: Callable[[], tuple[Sequence[Job], Path | None]]) -> Answer:
-    answer = _guarded(lambda: _train_lanes(*work()))
-    return answer if isinstance(answer, str) else [_guarded(finished) for finished in answer]
+    """Train a batch; if that raises, each of its cells alone, so that one bad cell takes no other with it."""
+    unpacked = _guarded(work)
+    if isinstance(unpacked, str):
+        return unpacked
+    batch, folder = unpacked
+    answer = _guarded(lambda: _train_lanes(batch, folder))
+    if not isinstance(answer, str):
+        return [_guarded(finished) for finished in answer]
+    cells = dict.fromkeys(cell for cell, _ in batch)
+    if len(cells) < 2:
+        return answer
+    alone: dict[Job, Any] = {}
+    for cell in cells:
+        jobs = [job for job in batch if job[0] == cell]
+        answers = _attempt(lambda jobs=jobs: (jobs, folder))
+        alone |= zip(jobs, [answers] * len(jobs) if isinstance(answers, str) else answers, strict=True)
+    return [alone[job] for job in batch]
 
 
 def _guarded(action: Callable[[], Any]) -> Any:
@@ -276,7 +410,9 @@ def _guarded(action: Callable[[], Any]) -> Any:
 
 
 def _work(pipe: Connection, core: int | None) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    for number in _SIGNALS:
+        signal.signal(number, signal.SIG_IGN)  # the parent decides
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     if core is not None:
         os.sched_setaffinity(0, {core})
     try:
@@ -286,42 +422,68 @@ def _work(pipe: Connection, core: int | None) -> None:
         return  # the parent is done, or gone
 
 
-def _spread(queue: list[list[Job]], workers: int, folder: Path | None) -> Outcomes:
+def _end_with_parent() -> None:
+    """End at once when the parent is gone, killed perhaps: somebody else may train the batch again."""
+    parent = mp.parent_process()
+    assert parent is not None
+    wait([parent.sentinel])
+    os._exit(1)
+
+
+def _spread(queue: list[list[Job]], workers: int, folder: Path | None, claim: Claim) -> Outcomes:
     """Hand batches to processes, one per core; a process prefers programs that it has compiled already."""
     context = mp.get_context("spawn")
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    packed = [(batch, _packed((batch, folder))) for batch in queue]
-    waiting = [(batch, data) for batch, data in packed if data is not None]
+    waiting: dict[Any, deque[list[Job]]] = {}  # by program, longest first
+    for batch in queue:
+        waiting.setdefault(shape_of(batch[0][0])[0], deque()).append(batch)
+    local: list[list[Job]] = []  # cannot be pickled
     processes: dict[Connection, tuple[Any, int | None]] = {}
     compiled: dict[Connection, set[Any]] = {}
     busy: dict[Connection, list[Job]] = {}
 
+    def take(mine: set[Any]) -> tuple[list[Job], bytes] | None:
+        others = set().union(*(programs for programs in compiled.values() if programs is not mine))
+
+        def rank(program: Any) -> tuple[int, int]:
+            longest = waiting[program][0]
+            known = 0 if program in mine else 1 if program not in others else 2
+            return known, -shape_of(longest[0][0])[1] * len(longest)
+
+        while waiting:
+            program = min(waiting, key=rank)
+            batch = claim(waiting[program].popleft())
+            if not waiting[program]:
+                del waiting[program]
+            data = _packed((batch, folder)) if batch else None
+            if data is not None:
+                mine.add(program)
+                return batch, data
+            if batch:
+                local.append(batch)
+        return None
+
+    def give(pipe: Connection, work: tuple[list[Job], bytes] | None) -> None:
+        if work:
+            busy[pipe] = work[0]
+            with suppress(OSError):  # a dead worker is noticed when its answer is read
+                pipe.send_bytes(work[1])
+
     def start(core: int | None) -> None:
+        mine: set[Any] = set()
+        work = take(mine)
+        if work is None:
+            return
         ours, theirs = context.Pipe()
         process = context.Process(target=_work, args=(theirs, core), daemon=True)
+        processes[ours], compiled[ours] = (process, core), mine  # before an interrupt can come between
         _start_deaf(process)
         theirs.close()
-        processes[ours], compiled[ours] = (process, core), set()
-        give(ours)
+        give(ours, work)
 
-    def give(pipe: Connection) -> None:
-        if not waiting:
-            return
-        mine = compiled[pipe]
-        others = set().union(*(programs for other, programs in compiled.items() if other is not pipe))
-
-        def rank(i: int) -> int:
-            program = shape_of(waiting[i][0][0][0])[0]
-            return 0 if program in mine else 1 if program not in others else 2
-
-        batch, data = waiting.pop(min(range(len(waiting)), key=rank))
-        mine.add(shape_of(batch[0][0])[0])
-        busy[pipe] = batch
-        with suppress(OSError):  # a dead worker is noticed when its answer is read
-            pipe.send_bytes(data)
-
+    complete = False
     try:
-        for i in range(min(workers, len(waiting))):
+        for i in range(min(workers, len(queue))):
             start(cores[i % len(cores)] if cores else None)
         while busy:
             for pipe in wait(list(busy)):
@@ -335,19 +497,22 @@ def _spread(queue: list[list[Job]], workers: int, folder: Path | None) -> Outcom
                     pipe.close()
                     process.join()
                     answer = f"the worker process died (exit code {process.exitcode}), out of memory perhaps"
-                    if waiting:
-                        start(core)
+                    start(core)
                 else:
-                    give(pipe)
+                    give(pipe, take(compiled[pipe]))
                 yield batch, answer
+        complete = True
     finally:
-        for pipe, (process, _) in processes.items():
+        begun = [process for process, _ in processes.values() if process.pid is not None]
+        for process in begun:
+            if not complete:
+                process.kill()
+        for pipe in processes:
             pipe.close()
-            if busy:
-                process.terminate()
-        for process, _ in processes.values():
+        for process in begun:
             process.join()
-    yield from _here((batch for batch, data in packed if data is None), folder)
+    for batch in local:
+        yield batch, _attempt(lambda batch=batch: (batch, folder))
 
 
 def _packed(work: tuple[list[Job], Path | None]) -> bytes | None:
@@ -358,13 +523,16 @@ def _packed(work: tuple[list[Job], Path | None]) -> bytes | None:
         return None
 
 
+_SIGNALS = {signal.SIGINT, signal.SIGTERM}
+
+
 def _start_deaf(process: Any) -> None:
-    """Start a process that a keyboard interrupt does not reach, not even while it is starting."""
+    """Start a process that a keyboard interrupt or SIGTERM does not reach, not even while it is starting."""
     if not hasattr(signal, "pthread_sigmask"):
         process.start()
         return
     resource_tracker.ensure_running()  # started later, it would undo the mask
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         process.start()
     finally:

@@ -46,6 +46,11 @@ class Evidence:
             self._summaries[key] = statistics.summarise(self.values(cell, metric), metric)
         return self._summaries[key]
 
+    def moments(self, cell: Cell, metric: str) -> tuple[float, float]:
+        """Return mean and sd of one metric as its summary does, but at once: no interval is resampled."""
+        values = self.values(cell, metric)
+        return float(values.mean()), float(values.std(ddof=1)) if values.size > 1 else 0.0
+
     def row(self, study: str, **labels: Any) -> Row:
         """Return the only row of a study with these labels."""
         return self.studies[study].one(**labels)

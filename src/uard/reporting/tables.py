@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 SHOWN = ("trap_visits", "goal_rate", "true_return", "observed_return", "alignment_gap")
+PLAIN = 500  # rows from which on a terminal gets plain columns: rich needs a second for a thousand rows
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,9 @@ class Table:
 
     def to_rich(self, console: Console) -> None:
         """Print it."""
+        if len(self.rows) > PLAIN:
+            console.out(self._plain(), highlight=False)
+            return
         from rich.table import Table as RichTable
 
         table = RichTable(title=self.title, title_justify="left")
@@ -35,6 +39,16 @@ class Table:
         for r in self.rows:
             table.add_row(*r)
         console.print(table)
+
+    def _plain(self) -> str:
+        widths = [max(map(len, column)) for column in zip(self.columns, *self.rows, strict=True)]
+        lines = (
+            "  ".join(
+                x.ljust(w) if i < self.labels else x.rjust(w) for i, (x, w) in enumerate(zip(r, widths, strict=True))
+            )
+            for r in (self.columns, *self.rows)
+        )
+        return "\n".join([self.title, *(line.rstrip() for line in lines)])
 
 
 def number(x: float) -> str:
@@ -55,7 +69,12 @@ def number(x: float) -> str:
 
 def brief(s: Summary) -> str:
     """Mean +- sd."""
-    return f"{number(s.mean)} ± {number(s.sd)}"
+    return mean_sd(s.mean, s.sd)
+
+
+def mean_sd(mean: float, sd: float) -> str:
+    """Mean +- sd."""
+    return f"{number(mean)} ± {number(sd)}"
 
 
 def full(s: Summary) -> str:
@@ -68,7 +87,7 @@ def study_table(study: Study, evidence: Evidence) -> Table:
     names = tuple(name for name, _ in study.rows[0].labels)
     rows = []
     for r in study.rows:
-        metrics = tuple(brief(evidence.of(r.cell, m)) for m in SHOWN)
+        metrics = tuple(mean_sd(*evidence.moments(r.cell, m)) for m in SHOWN)
         rows.append((*(str(v) for _, v in r.labels), *metrics))
     columns = (*names, *(m.replace("_", " ") for m in SHOWN))
     return Table(

@@ -1,0 +1,81 @@
+"""Who is training what: the processes that share a store, and whether they are still alive."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import socket
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+BEAT = 15.0  # seconds between two signs of life
+LEASE = 120.0  # seconds without one, after which a process that cannot be looked at is held for dead
+
+_at_work: set[str] = set()  # tokens of owners in this process
+
+
+@dataclass(frozen=True)
+class Owner:
+    """One run of the runner in one process.
+
+    Attributes:
+        token: Random, so that no two are equal.
+        host: Name of the machine, for people.
+        place: Where ``pid`` and ``born`` mean something: one start of one kernel, one namespace of processes. Empty
+            where a process cannot be looked at.
+        pid: Process id.
+        born: When the process started, in the kernel's ticks: a later process with the same id has another one.
+    """
+
+    token: str
+    host: str
+    place: str
+    pid: int
+    born: int
+
+    @staticmethod
+    def here() -> Owner:
+        """Return a new owner in this process."""
+        born = _born(os.getpid())
+        owner = Owner(secrets.token_hex(8), socket.gethostname(), _place() if born else "", os.getpid(), born or 0)
+        _at_work.add(owner.token)
+        return owner
+
+    def stop(self) -> None:
+        """Be dead from now on, for this process at least."""
+        _at_work.discard(self.token)
+
+    def alive(self, beat: float, now: float | None = None) -> bool:
+        """Whether it still runs: exactly if it is of this machine (Linux), by its last sign of life elsewhere.
+
+        Args:
+            beat: When it gave that sign, in seconds since 1970.
+            now: The time; that of this machine's clock if left out.
+        """
+        if self.place and self.place == _place():
+            if self.pid == os.getpid() and _born(self.pid) == self.born:
+                return self.token in _at_work
+            return _born(self.pid) == self.born
+        return (time.time() if now is None else now) - beat < LEASE
+
+    def __str__(self) -> str:
+        """Name it as people do."""
+        return f"{self.host}:{self.pid}"
+
+
+def _born(pid: int) -> int | None:
+    """Return when a process started; None if it has ended (a zombie has) or nobody can tell."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except (OSError, UnicodeDecodeError):
+        return None
+    return None if fields[0] in "ZX" else int(fields[19])
+
+
+def _place() -> str:
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        return f"{boot} {os.readlink('/proc/self/ns/pid')}"
+    except OSError:
+        return ""

@@ -1,0 +1,204 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from uard.lab import runner
+from uard.lab.cell import Cell
+from uard.lab.claims import LEASE, Owner
+from uard.lab.result import Result
+from uard.lab.store import Store, StoreError, give_sign
+
+ONE, TWO = Cell(episodes=3), Cell(episodes=4)
+JOBS = [(ONE, 0), (ONE, 1), (TWO, 0)]
+LINUX = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes can be looked at on Linux only")
+
+
+def result(steps=1):
+    return Result(np.zeros((3, 6), np.float32) + 1, steps, np.zeros(2, np.int32), {})
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "s.sqlite"
+
+
+@pytest.fixture
+def store(path):
+    with closing(Store(path)) as opened:
+        yield opened
+
+
+@pytest.fixture
+def owner():
+    made = Owner.here()
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def stranger():
+    """An owner in a process that has been killed and not been waited for."""
+    code = "from uard.lab.claims import Owner; import time; print(repr(Owner.here()), flush=True); time.sleep(60)"
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    yield process, eval(process.stdout.readline(), {"Owner": Owner})
+    process.kill()
+    process.communicate()
+
+
+@LINUX
+def test_a_process_is_alive_until_it_is_killed_whatever_its_last_sign(stranger):
+    process, other = stranger
+    assert other.alive(beat=0)
+    assert not replace(other, born=other.born - 1).alive(beat=time.time()), "a later process with the same id"
+    process.send_signal(signal.SIGKILL)
+    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+    assert not other.alive(beat=time.time()), "a zombie"
+    process.wait()
+    assert not other.alive(beat=time.time())
+
+
+def test_one_that_has_stopped_is_dead_though_its_process_lives(owner):
+    assert owner.alive(beat=time.time())
+    owner.stop()
+    assert not owner.alive(beat=time.time()) or not owner.place
+
+
+def test_elsewhere_the_last_sign_of_life_decides(owner):
+    far = replace(owner, place="another kernel")
+    for other in (far, replace(owner, place="")):
+        assert other.alive(beat=1000, now=1000 + LEASE - 1)
+        assert not other.alive(beat=1000, now=1000 + LEASE)
+
+
+def test_what_is_claimed_is_claimed_once(store, path, owner):
+    other = Owner.here()
+    with closing(Store(path)) as second:
+        store.begin(owner, 3)
+        second.begin(other, 3)
+        assert store.claim(JOBS[:2], owner) == JOBS[:2]
+        assert second.claim(JOBS, other) == JOBS[2:]
+        assert store.claim(JOBS, owner) == []
+        assert {job: run.owner for job, run in store.claimed().items()} == {
+            (ONE.key, 0): owner,
+            (ONE.key, 1): owner,
+            (TWO.key, 0): other,
+        }
+        store.put([(ONE, 0, result())])
+        assert (ONE.key, 0) not in second.claimed()
+        assert second.claim(JOBS[:1], other) == [], "finished"
+        store.end(owner)
+        assert second.claim(JOBS, other) == [(ONE, 1)]
+        assert store.attempts()[ONE.key, 1] == [owner.token, other.token]
+        assert [(r.owner, r.claimed) for r in store.runs() if r.ended is None] == [(other, 2)]
+    other.stop()
+
+
+@LINUX
+def test_claims_of_the_dead_are_taken_over(store, owner, stranger):
+    process, dead = stranger
+    store.begin(dead, 3)
+    assert store.claim(JOBS, dead) == JOBS
+    store.begin(owner, 3)
+    assert store.claim(JOBS, owner) == []
+    process.kill()
+    process.wait()
+    assert store.claimed() == {}
+    assert store.claim(JOBS[:1], owner) == JOBS[:1]
+    third = Owner.here()
+    store.begin(third, 2)
+    assert {r.owner for r in store.runs() if r.ended is None} == {owner, third}
+    assert len(store.claimed()) == 1
+    store.put([(ONE, 0, result(1))])
+    store.put([(ONE, 0, result(2))])
+    assert store.get(ONE, [0])[0].steps == 1, "a late result of the dead changes nothing"
+
+
+def test_a_sign_of_life_revives_one_that_was_held_for_dead(store, path, owner):
+    far = replace(owner, place="another kernel", token="far")
+    store.begin(far, 1)
+    with store._writing():
+        store._db.execute("update runs set beat = 0 where token = 'far'")
+    assert [run.alive for run in store.runs()] == [False]
+    store.begin(owner, 1)
+    assert far not in [run.owner for run in store.runs() if run.ended is None]
+    give_sign(str(path), far)
+    assert {run.owner.token: run.alive for run in store.runs()} == {"far": True, owner.token: True}
+
+
+def test_why_a_seed_failed_is_kept_until_it_is_finished(store, owner):
+    store.begin(owner, 3)
+    store.claim(JOBS, owner)
+    store.fail(JOBS[:2], "Traceback ...\n  in line 3\nValueError: no", owner)
+    assert store.failures().keys() == {(ONE.key, 0), (ONE.key, 1)}
+    why = store.failures()[ONE.key, 0]
+    assert (why.error, why.token) == ("ValueError: no", owner.token)
+    assert "in line 3" in why.traceback
+    assert store.claimed().keys() == {(TWO.key, 0)}
+    store.fail(JOBS[:1], "KeyError: again", owner)
+    assert store.failures()[ONE.key, 0].error == "KeyError: again"
+    store.put([(ONE, 0, result())])
+    assert store.failures().keys() == {(ONE.key, 1)}
+
+
+def test_a_failure_elsewhere_is_not_repeated_and_an_older_one_is(store, owner):
+    store.begin(owner, 1)
+    store.fail([(ONE, 0)], "old", owner)
+    known = store.failures()
+    assert runner._look([(ONE, 0)], store, known) == ([], [(ONE, 0)], {})
+    store.fail([(ONE, 0)], "new", owner)
+    assert runner._look([(ONE, 0)], store, known) == ([], [], {(ONE, 0): "new"})
+
+
+def test_one_bad_cell_takes_no_other_of_its_batch_with_it(monkeypatch):
+    def train(batch, folder):
+        if any(cell == TWO for cell, _ in batch):
+            raise ValueError("not this one")
+        return [result] * len(batch)
+
+    monkeypatch.setattr(runner, "_train_lanes", train)
+    answers = runner._attempt(lambda: (JOBS, None))
+    assert [isinstance(a, Result) for a in answers] == [True, True, False]
+    assert answers[2].endswith("ValueError: not this one\n")
+    assert isinstance(runner._attempt(lambda: (JOBS[2:], None)), str)
+
+
+def older(path):
+    """A store as version 0.1.0 left it."""
+    with closing(Store(path)) as store:
+        store.put([(ONE, 0, result())])
+        for table in ("runs", "claims", "attempts", "failures"):
+            store._db.execute(f"drop table {table}")
+        store._db.execute("drop index results_finished")
+        store._db.execute("pragma journal_mode = delete")
+
+
+def test_a_store_of_an_older_version_is_read_unchanged_and_then_used(path, owner):
+    older(path)
+    before = path.read_bytes()
+    with closing(Store(path, readonly=True)) as store:
+        assert (store.count(), store.runs(), store.claimed(), store.failures()) == ((1, 1), [], {}, {})
+        assert store.finished()[ONE.key].keys() == {0}
+        with pytest.raises(StoreError, match="cannot be written"):
+            store.put([(ONE, 1, result())])
+    assert path.read_bytes() == before
+    with closing(Store(path)) as store:
+        store.begin(owner, 1)
+        assert store.claim([(ONE, 0), (ONE, 1)], owner) == [(ONE, 1)]
+
+
+def test_reading_makes_no_store(tmp_path):
+    for name in ("none.sqlite", "."):
+        with pytest.raises(StoreError, match="must be a result store, but there is no such file"):
+            Store(tmp_path / name, readonly=True)
+    (tmp_path / "empty").touch()
+    with pytest.raises(StoreError, match="another program's or another version's"):
+        Store(tmp_path / "empty", readonly=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["empty"]
