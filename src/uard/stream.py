@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from uard import _checks, uncertainty
+from uard import _checks
 from uard.abstention import Abstention
 from uard.mitigation import Evidence, Feedback, Mitigation, RewardDiscounting, uard
 from uard.reliability import discount
@@ -212,21 +212,20 @@ class RewardStream:
                 "ratings.shape", ratings.shape, f"({len(reward)}, K): one row per reward and one column per rater"
             )
         here = ~np.isnan(ratings)
-        number = here.sum(1)
+        number = np.add.reduce(here, 1)
         if not number.any():
             return said
         self._raters = max(self._raters, float(ratings.shape[1]))
-        if here.all() and ratings.shape[1] > max(1, self._ddof):
-            mean, lowest = ratings.mean(1), ratings.min(1)
-            spread = uncertainty.sigma_human(ratings, ddof=self._ddof)
-        else:
-            held = np.where(here, ratings, 0.0)
-            _checks.finite("ratings", held)
-            mean = held.sum(1) / np.maximum(number, 1)
-            lowest = np.where(here, ratings, np.inf).min(1)
-            square = np.where(here, (ratings - mean[:, None]) ** 2, 0.0).sum(1)
-            spread = np.sqrt(square / np.maximum(number - self._ddof, 1))
-        said[:] = np.stack([number > 0, mean, np.where(number > 0, lowest, 0.0), spread, reward], 1)
+        held = np.where(here, ratings, 0.0)
+        _checks.finite("ratings", held)
+        at_least = np.maximum(number, 1)
+        mean = np.add.reduce(held, 1) / at_least
+        square = np.where(here, (ratings - mean[:, None]) ** 2, 0.0)
+        said[:, 0] = number > 0
+        said[:, 1] = mean
+        said[:, 2] = np.where(number > 0, np.minimum.reduce(np.where(here, ratings, np.inf), 1), 0.0)
+        said[:, 3] = np.sqrt(np.add.reduce(square, 1) / np.maximum(number - self._ddof, 1))  # uncertainty.sigma_human
+        said[:, 4] = reward
         return said
 
     def _slot(self, key: Hashable) -> int:

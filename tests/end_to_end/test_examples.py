@@ -33,6 +33,10 @@ def test_a_study_with_intervals(tmp_path: Path) -> None:
     assert visits["0.0", "raw"] > 10 > 1 > visits["0.0", "uard"]
 
 
+def test_a_csv_of_ratings(tmp_path: Path) -> None:
+    assert "danger" in run("csv_of_ratings.py", tmp_path)
+
+
 @pytest.mark.parametrize("name", sorted(p.name for p in EXAMPLES.glob("*.py")))
 def test_every_example_has_a_test(name: str) -> None:
     assert name in Path(__file__).read_text() or name in "".join(

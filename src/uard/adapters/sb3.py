@@ -38,6 +38,8 @@ except ModuleNotFoundError as error:
         f"uard.adapters.sb3 needs Stable-Baselines3: pip install 'uard[sb3]' ({error})", name=error.name
     ) from error
 
+EVERY = 16  # steps of which one batch from the replay buffer is logged
+
 
 class ReliabilityVecEnv(VecEnvWrapper):
     """Emits filtered rewards; ``infos[i]`` also holds what ``uard.adapters.gymnasium.ReliabilityWrapper`` puts there.
@@ -293,6 +295,8 @@ class ReliabilityCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         if self._buffer is not None:
+            if self.n_calls % EVERY:
+                return True
             if self._buffer.latest is not None:
                 for name, where in (("reward", "reward"), *INFO.items()):
                     self.logger.record_mean(f"uard/{name}", float(getattr(self._buffer.latest, where).mean()))
