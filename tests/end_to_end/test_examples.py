@@ -34,7 +34,7 @@ def test_a_study_with_intervals(tmp_path: Path) -> None:
 
 
 def test_a_csv_of_ratings(tmp_path: Path) -> None:
-    assert "danger" in run("csv_of_ratings.py", tmp_path)
+    assert "DANGER" in run("csv_of_ratings.py", tmp_path)
 
 
 @pytest.mark.parametrize("name", sorted(p.name for p in EXAMPLES.glob("*.py")))

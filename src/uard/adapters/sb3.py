@@ -38,7 +38,7 @@ except ModuleNotFoundError as error:
         f"uard.adapters.sb3 needs Stable-Baselines3: pip install 'uard[sb3]' ({error})", name=error.name
     ) from error
 
-EVERY = 16  # steps of which one batch from the replay buffer is logged
+EVERY = 16  # steps of which one is logged
 
 
 class ReliabilityVecEnv(VecEnvWrapper):
@@ -46,6 +46,7 @@ class ReliabilityVecEnv(VecEnvWrapper):
 
     Attributes:
         steps: What filters; one for all environments.
+        latest: The rewards of the latest step.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class ReliabilityVecEnv(VecEnvWrapper):
         super().__init__(venv)
         key = key or natural_key(venv.observation_space, venv.action_space)
         self.steps = Steps(RewardStream(mitigation, abstention=abstention), ratings, sigma_m, key)
+        self.latest: Filtered | None = None
         self._observation: Any = None
         self._actions: Any = None
         self._returns = np.zeros((2, venv.num_envs))
@@ -92,7 +94,9 @@ class ReliabilityVecEnv(VecEnvWrapper):
         reached = following if self.steps.ratings is None else _reached(following, dones, infos)
         found = rows_of({i: x["ratings"] for i, x in enumerate(infos) if x.get("ratings") is not None}, len(infos))
         out = self.steps.filter(self._observation, self._actions, reached, np.asarray(rewards, float), found)
-        self._returns += np.stack([out.raw, out.reward])
+        self.latest = out
+        self._returns[0] += out.raw
+        self._returns[1] += out.reward
         columns = {name: getattr(out, where).tolist() for name, where in INFO.items()}
         for i, info in enumerate(infos):
             for name, values in columns.items():
@@ -261,8 +265,9 @@ def critics_of(model: Any) -> int:
 class ReliabilityCallback(BaseCallback):
     """Logs what the filter does under ``uard/``, and lends it the algorithm's critics where it has several.
 
-    Scalars (means since the last dump): ``weight``, ``sigma_m``, ``sigma_h``, ``lambda_t``, ``abstained``, ``reward``
-    and ``raw_reward``; with ``ReliabilityVecEnv`` also ``raw_return`` and ``filtered_return`` per episode.
+    Scalars, means of every sixteenth step since the last dump: ``weight``, ``sigma_m``, ``sigma_h``, ``lambda_t``,
+    ``abstained``, ``reward`` and ``raw_reward``; with ``ReliabilityVecEnv`` also ``raw_return`` and
+    ``filtered_return``, of every episode.
     """
 
     def __init__(self, critics: bool = True, verbose: int = 0):
@@ -270,42 +275,39 @@ class ReliabilityCallback(BaseCallback):
         super().__init__(verbose)
         self._critics = critics
         self._lent: list[Steps] = []
-        self._buffer: ReliabilityReplayBuffer | None = None
+        self._source: ReliabilityReplayBuffer | ReliabilityVecEnv | None = None
 
     def _on_training_start(self) -> None:
         buffer = getattr(self.model, "replay_buffer", None)
-        self._buffer = buffer if isinstance(buffer, ReliabilityReplayBuffer) else None
         env: Any = self.training_env
         while isinstance(env, VecEnvWrapper) and not isinstance(env, ReliabilityVecEnv):
             env = env.venv
-        wrapped = env if isinstance(env, ReliabilityVecEnv) else None
-        if self._buffer is None and wrapped is None:
+        filters = isinstance(buffer, ReliabilityReplayBuffer), isinstance(env, ReliabilityVecEnv)
+        if not any(filters):
             raise _checks.InvalidValueError(
                 "env", type(self.training_env).__name__, "a ReliabilityVecEnv, or give the ReliabilityReplayBuffer"
             )
-        if self._buffer is not None and wrapped is not None:
+        if all(filters):
             raise _checks.InvalidValueError(
                 "env", "ReliabilityVecEnv", "left out where the replay buffer filters: rewards would be filtered twice"
             )
-        steps = (self._buffer or wrapped).steps  # type: ignore[union-attr]
-        if self._critics and steps.sigma_m is None and critics_of(self.model) >= 2:
+        source: Any = buffer if filters[0] else env
+        self._source = source
+        if self._critics and source.steps.sigma_m is None and critics_of(self.model) >= 2:
             critics = CriticDisagreement(self.model)
-            steps.sigma_m = critics.outside if self._buffer is None else critics
-            self._lent.append(steps)
+            source.steps.sigma_m = critics if filters[0] else critics.outside
+            self._lent.append(source.steps)
 
     def _on_step(self) -> bool:
-        if self._buffer is not None:
-            if self.n_calls % EVERY:
-                return True
-            if self._buffer.latest is not None:
-                for name, where in (("reward", "reward"), *INFO.items()):
-                    self.logger.record_mean(f"uard/{name}", float(getattr(self._buffer.latest, where).mean()))
-                self._buffer.latest = None
-            return True
-        for info in self.locals["infos"]:
-            for name in (*INFO, "raw_return", "filtered_return"):
-                if name in info:
-                    self.logger.record_mean(f"uard/{name}", float(info[name]))
+        assert self._source is not None
+        latest = self._source.latest
+        if self.n_calls % EVERY == 0 and latest is not None:
+            for name, where in (("reward", "reward"), *INFO.items()):
+                self.logger.record_mean(f"uard/{name}", float(getattr(latest, where).mean()))
+        for i in np.flatnonzero(self.locals["dones"]):
+            for name in ("raw_return", "filtered_return"):
+                if name in self.locals["infos"][i]:
+                    self.logger.record_mean(f"uard/{name}", self.locals["infos"][i][name])
         return True
 
     def _on_training_end(self) -> None:
