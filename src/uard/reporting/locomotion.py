@@ -124,6 +124,17 @@ def losses(p: Published) -> list[str]:
         f"return of the agent trained on the true reward in {len(poor)}{_listed(poor)}. "
         f"With {p.seeds(HACKING)} seeds these shares are rough: see the intervals."
     )
+    tame = [
+        f"{r['robot']} {r['region']} {r['agent']}"
+        for r in p.rows(HACKING, mitigation="raw")
+        if (honest := _rival(p, r, "true reward")) is not None
+        and p.of(r, "true_return").ci95[1] >= p.of(honest, "true_return").ci95[0]
+    ]
+    if tame:
+        out.append(
+            f"MuJoCo: in {'; '.join(tame)} the raw agent's true return is not clearly below that of the agent trained on "
+            "the true reward, so there is little to prevent there, and its rows prove little."
+        )
     plain = [(r, shares(p, r)[1]) for r in ours if r["region"] == "none"]
     dear = [f"{_name(r)} {100 * (1 - x):.0f} %" for r, x in plain if x is not None and x < 1 - COST]
     if plain:
