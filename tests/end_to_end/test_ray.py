@@ -93,7 +93,7 @@ def test_a_lost_node_changes_no_byte_of_the_results(cluster_of_two, tmp_path):
     here, there = Store(tmp_path / "here.sqlite"), Store(tmp_path / "there.sqlite")
     left = []
 
-    def lose_a_node(done, total):
+    def lose_a_node(done, total, _):
         if done >= 2 and len(nodes) == 2:
             made.remove_node(nodes.pop(), allow_graceful=False)
             left.append(total - done)
