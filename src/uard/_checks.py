@@ -32,9 +32,9 @@ class UnknownNameError(InvalidValueError):
 
 
 def short(value: object) -> str:
-    """Return the value as text of at most 80 characters."""
+    """Return the value as text of at most 200 characters."""
     text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
+    return text if len(text) <= 200 else text[:197] + "..."  # a path must be legible
 
 
 def is_frozen(value: object) -> bool:

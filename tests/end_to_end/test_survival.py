@@ -5,7 +5,6 @@ UARD_KILLS=100 makes it that many kills instead of a few.
 
 import os
 import random
-import resource
 import signal
 import sqlite3
 import subprocess
@@ -252,19 +251,18 @@ def test_workers_end_with_their_parent(study):
 
 
 def test_a_full_disk_loses_nothing_and_the_same_command_goes_on(tmp_path):
-    command = [sys.executable, "-c", "from uard.cli import main; main()", "reproduce", "control", "--seeds", "30"]
+    limited = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000)); "
+    program, arguments = "from uard.cli import main; main()", ["reproduce", "control", "--seeds", "30"]
+    arguments += ["--store", "s.sqlite", "--workers", "1"]
     options = {"cwd": tmp_path, "capture_output": True, "text": True, "check": False}
 
-    def full():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000))
-
-    first = subprocess.run([*command, "--store", "s.sqlite", "--workers", "1"], preexec_fn=full, **options)
+    first = subprocess.run([sys.executable, "-c", limited + program, *arguments], **options)
     assert (first.returncode, first.stdout) == (2, "")
     assert "store = 's.sqlite': cannot be written (" in first.stderr
     assert "Traceback" not in first.stderr
     kept = blobs(tmp_path / "s.sqlite")
     assert 0 < len(kept) < 120
-    again = subprocess.run([*command, "--store", "s.sqlite", "--workers", "1"], **options)
+    again = subprocess.run([sys.executable, "-c", program, *arguments], **options)
     assert again.returncode == 0, again.stderr
     assert f"{120 - len(kept)} runs trained, {len(kept)} were in s.sqlite already" in " ".join(again.stderr.split())
     assert kept.items() <= blobs(tmp_path / "s.sqlite").items()

@@ -341,7 +341,6 @@ def test_slots():
 SPECS = [BoatRace(), TomatoWatering(), AbsentSupervisor(), CartPole(), Acrobot(), TrapGrid(6)]
 
 
-@jax.jit
 def one_step(world: Any, keys: jax.Array, actions: jax.Array) -> tuple[Any, ...]:
     states = jax.vmap(world.reset)(keys)
     after = jax.vmap(world.step)(states, actions, keys)
@@ -355,7 +354,9 @@ def one_step(world: Any, keys: jax.Array, actions: jax.Array) -> tuple[Any, ...]
 def test_every_world_compiles_and_maps(spec: Any, panel: str):
     world = spec.world(panel, 0.2)
     assert isinstance(world, World)
-    seen, after, said, verdicts, slots = one_step(world, jax.random.split(KEY, 3), jnp.array([0, 1, 0]))
+    seen, after, said, verdicts, slots = jax.jit(partial(one_step))(
+        world, jax.random.split(KEY, 3), jnp.array([0, 1, 0])
+    )
     assert seen.shape == (3, world.features)
     assert said.centre.shape == said.deviation.shape == (3, world.raters)
     assert {x.dtype for x in (seen, after.reward, after.doubt, *said[:2], verdicts.reward)} == {jnp.dtype("float32")}
