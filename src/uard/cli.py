@@ -257,15 +257,15 @@ def main(argv: Sequence[str] | None = None) -> None:
         with _terminable():
             _BODIES[type(command)](command, console)
     except (ClusterError, InvalidValueError, StoreError) as error:
-        console.print(f"[red]error:[/red] {_escape(str(error))}", soft_wrap=True)
+        _say(console, str(error), "[red]error:[/red] ")
         sys.exit(2)
     except StudyFailedError as error:
-        console.print(f"[red]error:[/red] {_escape(str(error))}", soft_wrap=True)
+        _say(console, str(error), "[red]error:[/red] ")
         _print_failures(error, command, console)
         sys.exit(1)
     except KeyboardInterrupt as stop:
         what, code = ("terminated", 143) if isinstance(stop, _TerminatedError) else ("interrupted", 130)
-        console.print(f"{what}; every finished cell is stored, the same command goes on from there")
+        _say(console, f"{what}; every finished cell is stored, the same command goes on from there")
         sys.exit(code)
 
 
@@ -296,15 +296,20 @@ def _print_failures(error: Any, command: Any, console: Console) -> None:
         for cell, seed in failure.jobs:
             cells.setdefault((names.get(cell.key) or str(cell), why), []).append(seed)
     for (name, why), seeds in list(cells.items())[:_LINES]:
-        console.print(f"failed: {_escape(name)}, seeds {sorted(seeds)}: {_escape(why)}", soft_wrap=True)
+        _say(console, f"failed: {name}, seeds {sorted(seeds)}: {why}")
     if len(cells) > _LINES:
-        console.print(f"and {len(cells) - _LINES} cells more")
+        _say(console, f"and {len(cells) - _LINES} cells more")
     if isinstance(command, Reproduce):
         chosen = "".join(f"{name} " for name in command.studies)
         where = f"--store {command.store}"
         again = f"uard reproduce {chosen}--seeds {command.seeds} {where} --failed"
         errors = f"uard status {chosen}{where} --errors"
-        console.print(f"only these again: {_escape(again)}\ntheir tracebacks: {_escape(errors)}", soft_wrap=True)
+        _say(console, f"only these again: {again}\ntheir tracebacks: {errors}")
+
+
+def _say(console: Console, text: str, kind: str = "") -> None:
+    """Print a line whole, for a path that is broken in two can be neither copied nor found."""
+    console.print(kind + _escape(text), soft_wrap=True)
 
 
 def _escape(text: str) -> str:
@@ -538,7 +543,7 @@ def _reproduce(command: Reproduce, console: Console) -> None:
         jobs = [(cell, seed) for cell, seed in jobs if (cell.key, seed) in failures]
     what = f"{len(chosen)} studies, {len(jobs)} runs"
     trained = _train(jobs, store, console, what, command.watch, command.workers, chosen, engine)
-    console.print(f"{trained} runs trained, {len(jobs) - trained} were in {command.store} already")
+    _say(console, f"{trained} runs trained, {len(jobs) - trained} were in {command.store} already")
     if command.failed:
         return
     if command.extract is not None:
@@ -551,7 +556,7 @@ def _reproduce(command: Reproduce, console: Console) -> None:
 
         with console.status("writing the report"):
             written = page.write(Path(command.report), store, seeds, command.mitigation)
-        console.print(f"report: {written}")
+        _say(console, f"report: {written}")
     else:
         from rich.console import Console
 
@@ -652,7 +657,7 @@ def _leaderboard(command: Leaderboard, console: Console) -> None:
 
     if not Path(command.store).is_file():
         raise _invalid("store", command.store, "a file that is there; `uard reproduce` and `uard run --store` make one")
-    console.print(f"leaderboard: {leaderboard.write(Path(command.out), Store(command.store))}", soft_wrap=True)
+    _say(console, f"leaderboard: {leaderboard.write(Path(command.out), Store(command.store))}")
 
 
 def _status(command: Status, console: Console) -> None:
@@ -674,9 +679,9 @@ def _status(command: Status, console: Console) -> None:
     if command.json == "-":
         return
     out = Console(highlight=False)
-    out.print(f"{_escape(command.store)}: {found.cells} cells, {found.seeds} seeds", soft_wrap=True)
+    _say(out, f"{command.store}: {found.cells} cells, {found.seeds} seeds")
     for line in status.lines(found.runs):
-        out.print(_escape(line), soft_wrap=True)
+        _say(out, line)
     columns = ("study", "seeds a cell", "finished", "in work", "failed", "missing", "last finished (UTC)")
     table = Table(*columns)
     for s in found.studies:
@@ -686,7 +691,7 @@ def _status(command: Status, console: Console) -> None:
     for failure in found.failures:
         what = failure.why.traceback if command.errors else failure.why.error
         when = status.clock(failure.why.created)
-        out.print(_escape(f"failed {when}: {failure.title}, seeds {list(failure.seeds)}: {what}"), soft_wrap=True)
+        _say(out, f"failed {when}: {failure.title}, seeds {list(failure.seeds)}: {what}")
 
 
 def _compare(command: Compare, console: Console) -> None:
@@ -722,9 +727,9 @@ def _compare(command: Compare, console: Console) -> None:
                 table.add_row(_escape(name), *counts, e.metric, difference, effect, f"{e.p:.3g}", style=style)
             out.print(table)
             if len(differing) > _LINES:
-                out.print(f"and {len(differing) - _LINES} cells more that differ; --json has them all")
+                _say(out, f"and {len(differing) - _LINES} cells more that differ; --json has them all")
         for line in compare.lines(found):
-            out.print(_escape(line), soft_wrap=True)
+            _say(out, line)
     if found.differs:
         sys.exit(1)
 
@@ -770,7 +775,7 @@ def _warn_of_broken(console: Console) -> None:
 
     for kind in plugins.KINDS:
         for error in names.brought(kind)[1]:
-            console.print(f"[yellow]warning:[/yellow] {_escape(str(error))}", soft_wrap=True)
+            _say(console, str(error), "[yellow]warning:[/yellow] ")
 
 
 _LINES = 20

@@ -199,7 +199,7 @@ def test_a_signal_ends_the_real_program_at_once_with_its_code(tmp_path, number, 
     os.killpg(process.pid, number)
     out, error = process.communicate(timeout=20)
     assert (process.returncode, out) == (code, "")
-    assert "every finished cell is stored, the same command goes on from there" in " ".join(error.split())
+    assert "every finished cell is stored, the same command goes on from there" in error
     assert "Traceback" not in error
     with closing(Store(tmp_path / "s.sqlite", readonly=True)) as store:
         assert store.failures() == {}
@@ -264,5 +264,5 @@ def test_a_full_disk_loses_nothing_and_the_same_command_goes_on(tmp_path):
     assert 0 < len(kept) < 120
     again = subprocess.run([sys.executable, "-c", program, *arguments], **options)
     assert again.returncode == 0, again.stderr
-    assert f"{120 - len(kept)} runs trained, {len(kept)} were in s.sqlite already" in " ".join(again.stderr.split())
+    assert f"{120 - len(kept)} runs trained, {len(kept)} were in s.sqlite already" in again.stderr
     assert kept.items() <= blobs(tmp_path / "s.sqlite").items()
