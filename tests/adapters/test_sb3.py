@@ -20,14 +20,6 @@ from uard.mitigation import RatedReward, Raw, named
 GRID = "uard/TrapGrid6-v0"
 
 
-@pytest.fixture(autouse=True)
-def _one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 def grids(count=1, panel="main", **options):
     return make_vec_env(GRID, count, seed=0, env_kwargs={"panel": panel} | options)
 

@@ -55,14 +55,6 @@ pytestmark = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 def says(*scores, name="judge"):
     """A judge that gives one fixed list after the other."""
     left = list(scores)

@@ -1,6 +1,5 @@
 import json
 import re
-import shutil
 import sqlite3
 from itertools import pairwise
 from types import SimpleNamespace
@@ -66,27 +65,13 @@ def board(tmp_path_factory):
     store.close()
 
 
-@pytest.fixture(scope="module")
-def chromium():
-    found = [p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p]
-    if not found:
-        pytest.skip("no browser: chromium, chromium-browser or google-chrome is not on the PATH")
-    from playwright.sync_api import sync_playwright
-
-    flags = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
-    with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=found[0], args=flags)
-        yield started
-        started.close()
-
-
 @pytest.fixture
-def opened(board, chromium):
+def opened(board, browser):
     """The page as a reader opens it from its file; whatever goes wrong in it or leaves the machine fails the test."""
     pages, wrong = [], []
 
     def open_(**options):
-        page = chromium.new_page(**options)
+        page = browser.new_page(**options)
         page.on("pageerror", lambda error: wrong.append(str(error)))
         page.on("console", lambda m: wrong.append(m.text) if m.type in ("error", "warning") else None)
         page.on("request", lambda r: None if r.url.startswith(("file:", "data:")) else wrong.append(r.url))

@@ -1,7 +1,6 @@
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -28,20 +27,6 @@ def made(shared):
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stderr
         return SimpleNamespace(page=page, store=store, ledger=json.loads((page.parent / "ledger.json").read_text()))
-
-
-@pytest.fixture(scope="session")
-def browser():
-    found = [p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p]
-    if not found:
-        pytest.skip("no browser: chromium, chromium-browser or google-chrome is not on the PATH")
-    from playwright.sync_api import sync_playwright
-
-    flags = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
-    with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=found[0], args=flags)
-        yield started
-        started.close()
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 import pickle
 from functools import partial
@@ -23,7 +24,7 @@ from uard.envs.gym import Evaluation
 from uard.envs.gym_gaming import GamingEnv, absent_supervisor, boat_race, tomato_watering
 from uard.envs.tabular import Task
 from uard.envs.trapgrid import TrapGrid
-from uard.envs.world import World
+from uard.envs.world import TableWorld, World
 
 UP, DOWN, LEFT, RIGHT = range(4)
 LAP = [RIGHT, RIGHT, DOWN, DOWN, LEFT, LEFT, UP, UP]
@@ -341,6 +342,7 @@ def test_slots():
 SPECS = [BoatRace(), TomatoWatering(), AbsentSupervisor(), CartPole(), Acrobot(), TrapGrid(6)]
 
 
+@jax.jit
 def one_step(world: Any, keys: jax.Array, actions: jax.Array) -> tuple[Any, ...]:
     states = jax.vmap(world.reset)(keys)
     after = jax.vmap(world.step)(states, actions, keys)
@@ -354,9 +356,7 @@ def one_step(world: Any, keys: jax.Array, actions: jax.Array) -> tuple[Any, ...]
 def test_every_world_compiles_and_maps(spec: Any, panel: str):
     world = spec.world(panel, 0.2)
     assert isinstance(world, World)
-    seen, after, said, verdicts, slots = jax.jit(partial(one_step))(
-        world, jax.random.split(KEY, 3), jnp.array([0, 1, 0])
-    )
+    seen, after, said, verdicts, slots = one_step(world, jax.random.split(KEY, 3), jnp.array([0, 1, 0]))
     assert seen.shape == (3, world.features)
     assert said.centre.shape == said.deviation.shape == (3, world.raters)
     assert {x.dtype for x in (seen, after.reward, after.doubt, *said[:2], verdicts.reward)} == {jnp.dtype("float32")}
@@ -366,6 +366,12 @@ def test_every_world_compiles_and_maps(spec: Any, panel: str):
     assert not any(x.weak_type for x in jax.tree.leaves((seen, after, said, verdicts, slots)))
     assert (said.deviation >= 0.2 - 1e-6).all()
     assert int(world.horizon) == spec.horizon
+
+
+def test_no_two_worlds_are_one_structure_to_jax():
+    structures = [jax.tree.structure(s.world()) for s in SPECS if not isinstance(s.world(), TableWorld)]
+    assert len(structures) == 3
+    assert not any(a == b for a, b in itertools.combinations(structures, 2)), "jit could mix up their programs"
 
 
 def test_the_numbers_of_a_world_are_data():

@@ -15,7 +15,7 @@ from uard import _checks
 from uard.envs import panels
 
 if TYPE_CHECKING:
-    from uard.envs.classic_world import AcrobotWorld, CartPoleWorld
+    from uard.envs.classic_world import ClassicWorld
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,12 @@ class CartPole:
         """
         _checks.whole("horizon", self.horizon, low=1, high=100_000)
 
-    def world(self, panel: str = "main", noise: float = 0.0) -> CartPoleWorld:
+    def world(self, panel: str = "main", noise: float = 0.0) -> ClassicWorld:
         """Return the compiled world, each step rated by a panel (needs JAX)."""
-        from uard.envs.classic_world import CartPoleWorld
+        from uard.envs.classic_world import CART_POLE, ClassicWorld
 
         panels.check(panel, noise)
-        return CartPoleWorld(np.int32(self.horizon), np.float32(noise), panel)
+        return ClassicWorld(np.int32(self.horizon), np.float32(noise), panel, CART_POLE)
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ class Acrobot:
         """
         _checks.whole("horizon", self.horizon, low=1, high=100_000)
 
-    def world(self, panel: str = "main", noise: float = 0.0) -> AcrobotWorld:
+    def world(self, panel: str = "main", noise: float = 0.0) -> ClassicWorld:
         """Return the compiled world, each step rated by a panel (needs JAX)."""
-        from uard.envs.classic_world import AcrobotWorld
+        from uard.envs.classic_world import ACROBOT, ClassicWorld
 
         panels.check(panel, noise)
-        return AcrobotWorld(np.int32(self.horizon), np.float32(noise), panel)
+        return ClassicWorld(np.int32(self.horizon), np.float32(noise), panel, ACROBOT)

@@ -4,6 +4,10 @@ A world is a pytree (its numbers are data, so that one program serves many world
 for one state; loops map them over batches. What an agent may see of a step is what ``observe``, ``step`` and the
 panel's ratings give. ``judge`` is for evaluation only: loops write it into their log and hand it to no agent, feedback
 model or mitigation.
+
+A world's class is registered by ``register_pytree_node_class``, or is told from others by a static field: JAX 0.10
+takes two classes registered by ``register_dataclass`` for one structure if their fields are alike, and ``jit`` may mix
+them up.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ DEEP_BATCH = 5  # the same for deep agents; some ten seconds
 
 Job = tuple[Cell, int]
 Progress = Callable[[int, int, float | None], None]
-Stored = Callable[[Sequence[tuple[Cell, int, Result]]], None]
+OnStored = Callable[[Sequence[tuple[Cell, int, Result]]], None]
 Claim = Callable[[list[Job]], list[Job]]
 POLL = 0.5  # seconds between two looks at what other processes have done
 
@@ -199,7 +199,7 @@ def run(
     store: Store,
     workers: int | None = None,
     progress: Progress | None = None,
-    stored: Stored | None = None,
+    stored: OnStored | None = None,
     engine: Engine | None = None,
 ) -> int:
     """Train the jobs that are not in the store yet; return how many of them this process has trained.

@@ -156,10 +156,6 @@ class Done(NamedTuple):
     live: Live
 
 
-class DivergedError(FloatingPointError):
-    """A run that left the finite numbers; names the quantity and the step."""
-
-
 def key_of(seed: int, stream: int, number: int = 0) -> Any:
     """Return a key that depends on nothing but its arguments."""
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), stream), number)
@@ -228,7 +224,8 @@ def run(
         stop: Asked after each piece; True writes a checkpoint and raises KeyboardInterrupt.
 
     Raises:
-        DivergedError: a parameter or the physics left the finite numbers; the last good checkpoint is kept.
+        FloatingPointError: a parameter or the physics left the finite numbers; names the quantity and the step. The
+            last good checkpoint is kept.
         CheckpointError: the checkpoint is truncated, or of another configuration.
     """
     from uard.training import host_off_policy, host_on_policy
@@ -252,7 +249,7 @@ def run(
             try:
                 live = advance(live, physics)
             except FloatingPointError as error:
-                raise DivergedError(f"{error} (environment step {int(live.steps)} of seed {job.seed})") from error
+                raise FloatingPointError(f"{error} (environment step {int(live.steps)} of seed {job.seed})") from error
             if progress:
                 progress(min(int(live.steps), job.steps), job.steps)
             stopped = stop is not None and stop()
