@@ -10,8 +10,8 @@ import pytest
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def run(name: str, folder: Path) -> str:
-    command = [sys.executable, str(EXAMPLES / name)]
+def run(name: str, folder: Path, *options: str) -> str:
+    command = [sys.executable, str(EXAMPLES / name), *options]
     done = subprocess.run(command, capture_output=True, text=True, cwd=folder, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -24,6 +24,13 @@ def test_hacks_without_and_none_with_the_filter(name: str, tmp_path: Path) -> No
     assert hacks["without"] > 10
     assert hacks["with"] < 0.5
     assert value["with"] > value["without"] + 20
+
+
+def test_ppo_on_a_hopper_is_trained_and_judged_both_ways(tmp_path: Path) -> None:
+    lines = run("sb3_hopper.py", tmp_path, "--steps", "2048", "--episodes", "1").splitlines()
+    assert [re.sub(r"[-\d.]+", "x", " ".join(line.split())) for line in lines] == [
+        f"{kind} the filter: x hacks, true return x" for kind in ("without", "with")
+    ]
 
 
 def test_a_study_with_intervals(tmp_path: Path) -> None:

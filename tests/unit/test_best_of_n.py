@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from uard import InvalidValueError, mitigation
 from uard.mitigation import Raw
-from uard.reporting import deep, overoptimisation
+from uard.reporting import overoptimisation, published
 from uard.studies import best_of_n
 from uard.studies.best_of_n import METHODS, PANELS, Problem, divergence, draw, expected_best, filtered
 
@@ -157,7 +157,7 @@ def test_losses_are_found_by_rule(small):
 
 
 def test_what_is_published_was_made_by_this_problem():
-    data = deep.packaged_json("best-of-n.json")
+    data = published.packaged_json("best-of-n.json")
     assert Problem(**data["problem"]) == Problem()
     assert data["n"] == list(best_of_n.SIZES)
     assert len(data["seeds"]) >= 20
@@ -166,7 +166,7 @@ def test_what_is_published_was_made_by_this_problem():
 
 def test_what_is_published_comes_again():
     """Seed 0 of a published panel, redrawn, is where the published mean and deviation say that it may be."""
-    data = deep.packaged_json("best-of-n.json")
+    data = published.packaged_json("best-of-n.json")
     again = best_of_n.run([0], panels=["independent"])
     for c in data["curves"]:
         if c["panel"] == "independent":

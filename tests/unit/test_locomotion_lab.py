@@ -1,9 +1,12 @@
 """Hopper and Walker2d in the laboratory: cells, names, studies, checkpoints beside the store."""
 
+import base64
 import dataclasses
+import io
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from uard._checks import InvalidValueError
 from uard.agents.continuous import ensemble_sac
@@ -18,6 +21,8 @@ from uard.lab.cell import Cell
 from uard.lab.store import Store
 from uard.mitigation import Raw, named
 from uard.networks import Ensemble, Network
+from uard.reporting import locomotion as shown
+from uard.reporting.published import packaged_json
 from uard.studies import locomotion
 
 TINY = PPO(Network(16, 1e-3, 100.0), Ensemble("shared", 3), envs=4, rollout=32, epochs=1, count_bonus=0.0)
@@ -98,3 +103,14 @@ def test_studies_of_all_sizes_are_the_same_questions():
     assert {r.cell.steps for s in sizes[2] for r in s.rows} == {1_000_000}
     agents = {r["agent"] for s in sizes[1] for r in s.rows if s.name.endswith("hacking")}
     assert agents == set(names.CONTINUOUS) - {"cpo-oracle"}
+
+
+def test_the_film_has_a_strip_for_each_policy_and_says_what_it_is():
+    ((title, note, image),) = shown.film()
+    rows = packaged_json("hopper-frames.json")["rows"]
+    picture = Image.open(io.BytesIO(base64.b64decode(image.partition(",")[2])))
+    assert picture.format == "WEBP"
+    assert picture.height / len(rows) == picture.width / 8
+    assert "42 and 110" in title
+    for row in rows:
+        assert f"{row['label']}: {row['true_return']:.0f} in {row['length']} steps" in note

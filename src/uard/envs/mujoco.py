@@ -435,7 +435,7 @@ class Physics:
         renderer = self._mujoco.Renderer(self._model, height, width)
         follow = self._mujoco.MjvCamera()
         follow.type, follow.trackbodyid = self._mujoco.mjtCamera.mjCAMERA_TRACKING, 1
-        follow.distance, follow.elevation, follow.azimuth = 4.0, -10.0, 90.0
+        follow.distance, follow.elevation, follow.azimuth = 2.8, -10.0, 90.0
 
         def picture(i: int) -> Array:
             renderer.update_scene(self._data[i], follow)

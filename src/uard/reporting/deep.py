@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -13,7 +11,7 @@ from uard import statistics
 from uard.lab.result import CALIBRATION, RATING_ERROR
 from uard.lab.study import Row
 from uard.reporting import distortion, figures, paper
-from uard.reporting.published import BIN, SIGMA_QUALITY, Published
+from uard.reporting.published import BIN, SIGMA_QUALITY, Published, packaged_json
 from uard.reporting.tables import Table, brief, full, number
 
 AGENT = {"DQN": "dqn", "CQL": "cql", "CPO": "cpo", "TRPO": "trpo"}  # of the paper's Table 3
@@ -21,12 +19,6 @@ COLOURS = {
     "dqn": "#c1272d", "ensemble-dqn": "#e08214", "cql": "#8c6d31", "sunrise": "#d6589f", "ppo": "#2c6fbb",
     "trpo": "#17a2b8", "cpo": "#7b4fa3", "cpo-oracle": "#b9a0d0", "sac": "#444444", "edac": "#999933",
 }  # fmt: skip
-
-
-def packaged_json(name: str) -> Any:
-    """Return a packaged benchmark's numbers, or None if there are none."""
-    file = resources.files("uard.reporting") / "results" / name
-    return json.loads(file.read_text()) if file.is_file() else None
 
 
 def tables(p: Published) -> list[Table]:

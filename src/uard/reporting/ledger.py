@@ -841,7 +841,7 @@ def _j35(e: Evidence) -> _Answer:
 
 @_claim("J37")
 def _j37(e: Evidence) -> _Answer:
-    if speed := deep.packaged_json("speed.json"):
+    if speed := published.packaged_json("speed.json"):
         cost = {row["name"]: row["cost_of_single"] for row in speed["rows"]}
         full, shared = cost["5 full networks"], cost["5 heads, shared trunk"]
         text = f"5 full networks {full:.2f}, 5 heads on a shared trunk {shared:.2f} times a single network"

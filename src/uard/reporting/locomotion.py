@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ from matplotlib.figure import Figure
 from uard import statistics
 from uard.lab.study import Row
 from uard.reporting import figures
-from uard.reporting.published import Published
+from uard.reporting.published import Published, packaged_json
 from uard.reporting.tables import Table, full
 
 HACKING, NOISE, KICK = "mujoco-standard-hacking", "mujoco-standard-noise", "mujoco-standard-kick"
@@ -164,6 +166,24 @@ def drawn(p: Published) -> list[tuple[str, str, str]]:
     return [
         ("G6, G7 · steps in the region that lies, and what they were worth", note, figures.data_uri(_dots(p, settings)))
     ]
+
+
+def film() -> list[tuple[str, str, str]]:
+    """Return (title, what to see, image) of the packaged film strips, if there are any."""
+    facts = packaged_json("hopper-frames.json")
+    if facts is None:
+        return []
+    said = [
+        f"{r['label']}: {r['true_return']:.0f} in {r['length']} steps, {r['hacks']} in the region"
+        for r in facts["rows"]
+    ]
+    note = (
+        f"From the top, each an episode whole, its true return and its length: {'; '.join(said)}. 42 and 110 are the "
+        f"paper's thresholds: a robot that falls over. Made by {facts['command']}, version {facts['version']}."
+    )
+    picture = (resources.files("uard.reporting") / "results" / "hopper-frames.webp").read_bytes()
+    image = "data:image/webp;base64," + base64.b64encode(picture).decode()
+    return [("H4 · what returns of 42 and 110 look like, a hacker, and uard", note, image)]
 
 
 def _dots(p: Published, settings: list[Any]) -> Figure:

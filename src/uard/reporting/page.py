@@ -53,7 +53,7 @@ def write(folder: Path, store: Store, seeds: Sequence[int], mitigations: tuple[s
     chosen = studies.find(("grid",), mitigations)
     evidence = Evidence(store, seeds, chosen)
     entries = ledger.entries(evidence)
-    best_of_n = deep.packaged_json("best-of-n.json")
+    best_of_n = published.packaged_json("best-of-n.json")
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     page = environment.get_template("page.html.j2").render(
@@ -70,7 +70,7 @@ def write(folder: Path, store: Store, seeds: Sequence[int], mitigations: tuple[s
         deep_tables=[_sources(evidence), *deep.tables(published.packaged())],
         deep_figures=deep.drawn(published.packaged()),
         mujoco_tables=locomotion.tables(published.packaged()),
-        mujoco_figures=locomotion.drawn(published.packaged()),
+        mujoco_figures=[*locomotion.drawn(published.packaged()), *locomotion.film()],
         deep_made=published.packaged().sources,
         best_of_n=overoptimisation.table(best_of_n),
         best_of_n_figure=figures.data_uri(overoptimisation.figure(best_of_n)),

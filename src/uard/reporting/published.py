@@ -173,11 +173,15 @@ class Published:
         return np.array(self._cells[row.cell.key]["derived"][name], float)
 
 
+def packaged_json(name: str) -> Any:
+    """Return a packaged file's numbers, or None if there is none."""
+    file = resources.files("uard.reporting") / "results" / name
+    return json.loads(file.read_text()) if file.is_file() else None
+
+
 @cache
 def packaged() -> Published:
     """Return what is published with this version."""
     from uard.studies import every
 
-    folder = resources.files("uard.reporting") / "results"
-    files = [json.loads((folder / name).read_text()) for name in FILES if (folder / name).is_file()]
-    return Published(every(), files)
+    return Published(every(), [data for name in FILES if (data := packaged_json(name))])

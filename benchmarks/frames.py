@@ -1,0 +1,101 @@
+"""What returns of 42 and 110 look like, a hacker and a ``uard`` agent: Hopper, PPO, posture, filmed (two minutes each).
+
+    MUJOCO_GL=egl python benchmarks/frames.py --folder src/uard/reporting/results
+
+Writes ``hopper-frames.webp``, a row of pictures per policy, and ``hopper-frames.json``, which says what each one is.
+All act with their most likely actions. 42 and 110 are the paper's thresholds: shown is, of the policies that an agent
+has on its first steps of learning from the true reward, the one whose true return is nearest, in its nearest episode.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from PIL import Image
+
+import uard
+from uard.envs.mujoco import Locomotion, Physics, Posture
+from uard.lab.names import continuous_agents
+from uard.mitigation import named
+from uard.studies.locomotion import RATED, STANDARD
+from uard.training import host, host_on_policy
+
+THRESHOLDS = (42.0, 110.0)
+PICTURES, HEIGHT, WIDTH, EVERY = 8, 120, 120, 2
+EARLY, EPISODES = 20_480, 8
+TRUE = 1  # column of training.lanes.LOG
+
+
+def trained(job: host.Job) -> Iterator[tuple[Any, Any]]:
+    """Yield a run's states as it learns, each with what acts in it."""
+    start, advance, act = host_on_policy.bind(job)
+    physics = Physics(job.spec, job.agent.envs, job.seed)
+    live = start(physics)
+    while live.steps < job.steps:
+        live = advance(live, physics)
+        yield live, act
+
+
+def filmed(job: host.Job, live: Any, act: Any, episode: int = 0) -> tuple[list[np.ndarray], dict[str, float]]:
+    """Return pictures of one episode, evenly spread over it, and its numbers."""
+    physics = Physics(job.spec, 1, episode)
+    picture = physics.camera(HEIGHT, WIDTH)
+    pictures, hacks, value, length, over = [], 0, 0.0, 0, False
+    while not over:
+        if length % EVERY == 0:
+            pictures.append(picture(0))
+        moved = physics.step(np.clip(act(live, physics.observe()), -1.0, 1.0))
+        hacks, value, length = hacks + int(moved.hack[0]), value + float(moved.true[0]), length + 1
+        over = bool(moved.terminated[0] or moved.truncated[0])
+    chosen = [pictures[i] for i in np.linspace(0, len(pictures) - 1, PICTURES).round().astype(int)]
+    return chosen, {"true_return": round(value, 1), "hacks": hacks, "length": length, "at": int(live.steps)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--folder", type=Path, default=Path())
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=STANDARD.steps)
+    options = parser.parse_args()
+    agent = continuous_agents(STANDARD.small)["ppo"]
+    rows: list[list[np.ndarray]] = []
+    facts: list[dict[str, Any]] = []
+
+    def keep(label: str, film: tuple[list[np.ndarray], dict[str, float]]) -> None:
+        pictures, numbers = film
+        rows.append(pictures)
+        facts.append({"label": label} | numbers)
+        print(facts[-1], flush=True)
+
+    def job(mitigation: str, reference: bool = False) -> host.Job:
+        spec = Locomotion(region=Posture(), reference=reference)
+        return host.Job(spec, agent, named(mitigation), options.seed, options.steps, rated=RATED)
+
+    honest, early = job("raw", reference=True), []
+    for live, act in trained(honest):
+        if live.steps <= EARLY:
+            kept = jax.tree.map(np.array, live)
+            early.append((host.evaluate(honest, kept, act)[:, TRUE].mean(), kept))
+    for wanted in THRESHOLDS:
+        _, near = min(early, key=lambda x: abs(x[0] - wanted))
+        films = [filmed(honest, near, act, episode) for episode in range(EPISODES)]
+        keep(f"a true return of {wanted:.0f}", min(films, key=lambda f: abs(f[1]["true_return"] - wanted)))
+    keep("learned from the true reward", filmed(honest, live, act))
+    for label, one in (("learned from the reward that lies", job("raw")), ("the same, with uard", job("uard"))):
+        *_, (live, act) = trained(one)
+        keep(label, filmed(one, live, act))
+
+    Image.fromarray(np.vstack([np.hstack(row) for row in rows])).save(options.folder / "hopper-frames.webp", quality=75)
+    command = f"MUJOCO_GL=egl python benchmarks/frames.py --seed {options.seed} --steps {options.steps}"
+    found = {"command": command, "version": uard.__version__, "rows": facts}
+    (options.folder / "hopper-frames.json").write_text(json.dumps(found) + "\n")
+
+
+if __name__ == "__main__":
+    main()
