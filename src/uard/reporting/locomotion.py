@@ -206,5 +206,5 @@ def _dots(p: Published, settings: list[Any]) -> Figure:
     for name, colour in COLOURS.items():
         axes[0].plot([], [], "o", color=colour, label=name)
     axes[0].plot([], [], "o", color="#777777", mfc="none", label="appendix panel")
-    axes[0].legend(fontsize=8, loc="center right")
+    axes[0].legend(fontsize=8, loc="upper right")
     return figure
