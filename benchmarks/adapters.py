@@ -53,8 +53,12 @@ CASES = {
 }
 
 
-OURS = ((ReliabilityVecEnv, "step_wait"), (ReliabilityReplayBuffer, "add"), (ReliabilityReplayBuffer, "_get_samples"))
-OURS = (*OURS, (ReliabilityCallback, "_on_step"))
+OURS = (
+    (ReliabilityVecEnv, "step_wait"),
+    (ReliabilityReplayBuffer, "add"),
+    (ReliabilityReplayBuffer, "_get_samples"),
+    (ReliabilityCallback, "_on_step"),
+)
 THEIRS = ((DummyVecEnv, "step_wait"), (ReplayBuffer, "add"), (ReplayBuffer, "_get_samples"))
 
 
