@@ -179,7 +179,7 @@ def film() -> list[tuple[str, str, str]]:
     ]
     note = (
         f"From the top, each an episode whole, its true return and its length: {'; '.join(said)}. 42 and 110 are the "
-        f"paper's thresholds: a robot that falls over. Made by {facts['command']}, version {facts['version']}."
+        f"paper's thresholds: a robot that falls over. One seed. Made by {facts['command']}, version {facts['version']}."
     )
     picture = (resources.files("uard.reporting") / "results" / "hopper-frames.webp").read_bytes()
     image = "data:image/webp;base64," + base64.b64encode(picture).decode()
