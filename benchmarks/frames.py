@@ -24,7 +24,7 @@ from uard.envs.mujoco import Locomotion, Physics, Posture
 from uard.lab.names import continuous_agents
 from uard.mitigation import named
 from uard.studies.locomotion import RATED, STANDARD
-from uard.training import host, host_on_policy
+from uard.training import host
 
 THRESHOLDS = (42.0, 110.0)
 PICTURES, HEIGHT, WIDTH, EVERY = 8, 120, 120, 2
@@ -34,12 +34,12 @@ TRUE = 1  # column of training.lanes.LOG
 
 def trained(job: host.Job) -> Iterator[tuple[Any, Any]]:
     """Yield a run's states as it learns, each with what acts in it."""
-    start, advance, act = host_on_policy.bind(job)
+    loop = host.bind(job)
     physics = Physics(job.spec, job.agent.envs, job.seed)
-    live = start(physics)
+    live = loop.start(physics)
     while live.steps < job.steps:
-        live = advance(live, physics)
-        yield live, act
+        live = loop.advance(live, physics)
+        yield live, loop.act
 
 
 def filmed(job: host.Job, live: Any, act: Any, episode: int = 0) -> tuple[list[np.ndarray], dict[str, float]]:

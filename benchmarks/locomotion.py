@@ -102,22 +102,22 @@ def sac_flops(critics: int, shared: bool, hidden: int = 256, batch: int = 256) -
 
 def our_sac(agent: Any, mitigation: str, updates: int) -> Rate:
     from uard.mitigation import named
-    from uard.training import host, host_off_policy
+    from uard.training import host
 
     steps = updates + agent.warmup
     job = host.Job(Locomotion(region=None), agent, named(mitigation), 0, 10**6)
-    start_, advance, _ = host_off_policy.bind(job)
+    loop = host.bind(job)
     physics = Physics(job.spec, 1, 0)
-    live = start_(physics)
+    live = loop.start(physics)
     while live.steps < agent.warmup + 128:
-        live = advance(live, physics)
+        live = loop.advance(live, physics)
     state = [live]
 
     def run() -> float:
         live = state[0]
         begun, done = time.perf_counter(), int(live.steps)
         while live.steps < done + steps:
-            live = advance(live, physics)
+            live = loop.advance(live, physics)
         live.agent.trained.log_temperature.block_until_ready()
         state[0] = live
         return (int(live.steps) - done) / (time.perf_counter() - begun)
@@ -159,18 +159,18 @@ def their_sac(library: str, updates: int) -> Rate:
 def our_ppo(mitigation: str, rollouts: int) -> Rate:
     from uard.lab.names import continuous_agents
     from uard.mitigation import named
-    from uard.training import host, host_on_policy
+    from uard.training import host
 
     job = host.Job(Locomotion(region=None), continuous_agents()["ppo"], named(mitigation), 0, 10**6)
-    start_, advance, _ = host_on_policy.bind(job)
+    loop = host.bind(job)
     physics = Physics(job.spec, 8, 0)
-    state = [advance(start_(physics), physics)]
+    state = [loop.advance(loop.start(physics), physics)]
 
     def run() -> float:
         live, begun = state[0], time.process_time()
         done = int(live.steps)
         for _ in range(rollouts):
-            live = advance(live, physics)
+            live = loop.advance(live, physics)
         np.asarray(live.agent.policy.log_deviation)
         state[0] = live
         return (int(live.steps) - done) / (time.process_time() - begun)

@@ -5,7 +5,7 @@ import pytest
 from uard.agents.tabular import QLearning
 from uard.envs.trapgrid import TrapGrid
 from uard.mitigation import named
-from uard.training import fused, lanes
+from uard.training import fused, lanes, xla
 
 PROGRAM = fused.Program(episodes=20)
 FIELDS = ("log", "steps", "q")
@@ -36,3 +36,14 @@ def test_a_gpu_gets_its_program(three, monkeypatch):
     monkeypatch.setattr(lanes, "side_by_side", lambda *given: asked.append(given[1:]) or program(*given))
     assert len(lanes.train(three, fused.run, PROGRAM, FIELDS, room=3, tables=True)) == 3
     assert asked == [(fused.run, PROGRAM, FIELDS)]
+
+
+def test_programs_are_forgotten_before_a_process_has_too_many(monkeypatch):
+    cleared = []
+    monkeypatch.setattr(xla, "_held", set())
+    monkeypatch.setattr(xla, "HELD", 2)
+    monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(set(xla._held)))
+    for program in "abacb":
+        xla.make_room(program)
+    assert cleared == [{"a", "b"}]
+    assert xla._held == {"c", "b"}

@@ -11,6 +11,7 @@ from uard.agents.tabular import QLearning
 from uard.envs.spec import Tables
 from uard.envs.tabular import HiddenTruth, Task
 from uard.lab.cell import Cell
+from uard.lab.examine import examine
 from uard.lab.result import DivergedError, Result
 from uard.mitigation import Feedback, Mitigation
 
@@ -113,9 +114,9 @@ def finish_deep(cell: Cell, seed: int, out: dict[str, Any]) -> Result:
     return Result(log, int(out["steps"]), path, extra)
 
 
-def finish_host(done: Any) -> Result:
+def finish_host(job: Any, done: Any) -> Result:
     """Turn a run in MuJoCo into a result; ``evaluation`` and ``ends`` are those of ``training.host.Done``."""
-    extra = {"evaluation": done.evaluation.astype(np.float32), "ends": done.ends}
+    extra = {"evaluation": done.evaluation.astype(np.float32), "ends": done.ends} | examine(job, done.live)
     return Result(done.log.astype(np.float32), int(done.live.steps), np.zeros(0, np.int32), extra)
 
 

@@ -156,9 +156,10 @@ def checkpoint_of(folder: Path, cell: Cell, seed: int) -> Path:
 def _train_host(cell: Cell, seed: int, folder: Path | None) -> Result:
     from uard.lab.finish import finish_host
     from uard.training import host
-    from uard.training.xla import keep_programs
+    from uard.training.xla import keep_programs, make_room
 
     keep_programs()
+    make_room(shape_of(cell)[0])
     assert cell.steps is not None
     job = host.Job(
         cell.environment,
@@ -173,17 +174,18 @@ def _train_host(cell: Cell, seed: int, folder: Path | None) -> Result:
         cell.ddof,
     )
     path = None if folder is None else checkpoint_of(folder, cell, seed)
-    return finish_host(host.run(job, path, f"{cell.key} {seed}"))
+    return finish_host(job, host.run(job, path, f"{cell.key} {seed}"))
 
 
 def _train_deep(batch: Sequence[Job]) -> list[Callable[[], Result]]:
     from uard.agents.off_policy import OffPolicy
     from uard.lab.finish import finish_deep
     from uard.training import deep, lanes, off_policy, on_policy
-    from uard.training.xla import keep_programs
+    from uard.training.xla import keep_programs, make_room
 
     keep_programs()
     first = batch[0][0]
+    make_room(shape_of(first)[0])
     models = {cell: f if isinstance(f := cell.feedback, RatingModel) else None for cell, _ in batch}
     worlds = {cell: cell.environment.world(cell.panel, cell.noise) for cell, _ in batch}
     several = [

@@ -20,11 +20,12 @@ import numpy as np
 
 from uard.agents.value import DeepQ
 from uard.lab.cell import Cell
+from uard.lab.examine import STEPS, WINDOWS, inside
 from uard.lab.result import TABLES, Result
 from uard.mitigation import Evidence, Feedback, RatedReward, RewardDiscounting
 
-STEPS = 1000
-WINDOWS = ((200, 220), (400, 420), (750, 770))
+__all__ = ["STEPS", "WINDOWS", "activations", "inside", "walk"]
+
 BONUS = 1.5
 THRESHOLD = 0.3
 EPSILON = 0.05
@@ -47,12 +48,6 @@ class Trace(NamedTuple):
     caution: np.ndarray
     lam: np.ndarray
     counts: np.ndarray
-
-
-def inside() -> np.ndarray:
-    """Return which steps lie in a window, (STEPS,)."""
-    steps = np.arange(STEPS)
-    return np.any([(steps >= a) & (steps < b) for a, b in WINDOWS], axis=0)
 
 
 def walk(cell: Cell, result: Result, seed: int) -> Trace:

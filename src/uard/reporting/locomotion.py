@@ -1,4 +1,4 @@
-"""Tables, a figure and findings of Hopper and Walker2d (G6, G7, G10, G11; H4, H11, H12), from the published results."""
+"""Tables, figures and findings of Hopper and Walker2d (G6, G7, G10-G15; H4, H11-H16), from the published results."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from uard import statistics
+from uard.lab import examine
 from uard.lab.study import Row
 from uard.reporting import figures
 from uard.reporting.published import Published, packaged_json
 from uard.reporting.tables import Table, full
 
 HACKING, NOISE, KICK = "mujoco-standard-hacking", "mujoco-standard-noise", "mujoco-standard-kick"
+DISTORTION = "mujoco-standard-distortion"
 REMOVED, KEPT, COST = 0.936, 0.9, 0.05  # the paper's best reduction (J16); what is asked of a filter beside it
 METRICS = ("trap_visits", "true_return", "observed_return")
 COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", "uard": "#2c6fbb"}
@@ -23,7 +25,7 @@ COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", 
 
 def tables(p: Published) -> list[Table]:
     """Return all tables for which there are results."""
-    return [t for t in (_hacking(p), _noise(p), _kick(p)) if t.rows]
+    return [t for t in (_hacking(p), _noise(p), _kick(p), _distortion(p)) if t.rows]
 
 
 def _steps(p: Published, study: str) -> str:
@@ -110,6 +112,30 @@ def _kick(p: Published) -> Table:
     )  # fmt: skip
 
 
+def _distortion(p: Published) -> Table:
+    rows = []
+    for r in p.rows(DISTORTION):
+        names = (*examine.REACTION, *examine.WARNING)
+        columns = np.column_stack([p.derived(r, "reaction"), p.derived(r, "warning")]).T
+        rows.append(
+            (r["agent"], r["critics"], *(full(statistics.summarise(c, n)) for n, c in zip(names, columns, strict=True)))
+        )
+    return Table(
+        f"A distorted reward after training (G12, G14, G15; H13, H15, H16) on Hopper, {_steps(p, DISTORTION)}",
+        (
+            "agent", "critics", "exploit activations of 60", "share of the lie believed", "lambda_t in the windows",
+            "elsewhere", "AUROC of sigma_m: thrown off", "wrong value",
+        ),
+        tuple(rows),
+        2,
+        f"Trained on the true reward; then +{examine.BONUS:g} on the observed reward in three windows of 20 steps. An "
+        "activation is an adjusted reward above the true one by more than half of that. EDAC and SUNRISE read no "
+        "ratings, so this is no fair fight. Thrown off: chance that sigma_m is larger at a state one coordinate of which "
+        f"is off by {examine.THROWN:g} than at a visited one. Wrong value: that it is larger where the value is among the "
+        "most wrong quarter.",
+    )  # fmt: skip
+
+
 def losses(p: Published) -> list[str]:
     """Say where ``uard`` misses what is asked of it in MuJoCo, found by rule."""
     ours = [r for r in p.rows(HACKING, mitigation="uard")]
@@ -160,12 +186,78 @@ def drawn(p: Published) -> list[tuple[str, str, str]]:
     settings = list(
         dict.fromkeys((r["robot"], r["region"], r["agent"]) for r in p.rows(HACKING) if r["region"] != "none")
     )
-    if not settings:
-        return []
-    note = "One dot per seed, a bar at the mean. A mitigation works if hacks fall and the true return does not."
-    return [
-        ("G6, G7 · steps in the region that lies, and what they were worth", note, figures.data_uri(_dots(p, settings)))
-    ]
+    made = []
+    if settings:
+        note = "One dot per seed, a bar at the mean. A mitigation works if hacks fall and the true return does not."
+        made.append(("G6, G7 · steps in the region that lies, and what they were worth", note, _dots(p, settings)))
+    traced = p.rows(DISTORTION)
+    if len(traced) == len(p.studies[DISTORTION].rows):
+        note = "The first seed. Shaded: the windows in which the observed reward is inflated."
+        made.append(("G14, G15 · confidence-adjusted reward under distortion, Hopper", note, _adjusted(p)))
+        note = "Left: what each would learn from; right: lambda_t of uard, which should rise in the windows."
+        made.append(("G12 · a hacking region, and lambda_t, Hopper", note, _windows(p)))
+        note = (
+            "The reward of a random action's step is raised by epsilon and then filtered. Left: the mean advantage of the "
+            "agent's own action over it, on the learned critics; right: how often its sign is kept. Mean over seeds."
+        )
+        made.append(("G13 · sign preservation on learned critics, Hopper", note, _signs(p)))
+    return [(title, note, figures.data_uri(figure)) for title, note, figure in made]
+
+
+def _shaded(axes: Any) -> None:
+    for axis in axes:
+        for a, b in examine.WINDOWS:
+            axis.axvspan(a, b, color="#f2d7a0", alpha=0.6, lw=0)
+        axis.set(xlabel="step")
+
+
+def _traced(p: Published, agent: str) -> np.ndarray:
+    (r, *_) = p.rows(DISTORTION, agent=agent)
+    return p.derived(r, "trace")
+
+
+def _adjusted(p: Published) -> Figure:
+    figure, axes = figures._axes(2, 6.2, 3.8)
+    _shaded(axes)
+    for axis, rival in zip(axes, ("edac", "sunrise"), strict=True):
+        axis.plot(_traced(p, rival)[1], color="#c1272d", lw=1, label=rival)
+        axis.plot(_traced(p, "uard")[1], color=COLOURS["uard"], lw=1.2, label="ensemble-sac + uard")
+        axis.set(ylabel="confidence-adjusted reward")
+        axis.legend(loc="lower right")
+    return figure
+
+
+def _windows(p: Published) -> Figure:
+    figure, axes = figures._axes(2, 6.2, 3.8)
+    _shaded(axes)
+    observed, adjusted, caution, lam, _ = _traced(p, "uard")
+    for values, colour, label in (
+        (observed, "#c1272d", "naive (observed)"),
+        (caution, figures.COLOURS["lcb"], "Caution (mean - sd)"),
+        (adjusted, COLOURS["uard"], "uard"),
+    ):
+        axes[0].plot(values, color=colour, lw=1, label=label)
+    axes[0].set(ylabel="effective reward")
+    axes[0].legend(loc="lower right")
+    axes[1].plot(lam, color=COLOURS["uard"], lw=1)
+    axes[1].set(ylabel="lambda_t", yscale="log")
+    return figure
+
+
+def _signs(p: Published) -> Figure:
+    figure, axes = figures._axes(2, 6.2, 3.8)
+    for agent, style in (("uard", "-"), ("uard (ppo)", "--")):
+        (r, *_) = p.rows(DISTORTION, agent=agent)
+        mean = p.derived(r, "perturbed").reshape(-1, len(examine.EPSILONS), len(examine.PERTURBED)).mean(0)
+        for filtered, colour in ((True, COLOURS["uard"]), (False, "#c1272d")):
+            label = f"{'ensemble-sac' if agent == 'uard' else 'ppo'}, {'filtered' if filtered else 'raw reward'}"
+            for axis, column in zip(axes, (0, 2), strict=True):
+                axis.plot(examine.EPSILONS, mean[:, column + (not filtered)], color=colour, ls=style, label=label)
+    axes[0].axhline(0.0, color="k", lw=0.8)
+    for axis, label in zip(axes, ("advantage", "share of signs kept"), strict=True):
+        axis.set(xlabel="epsilon", ylabel=label)
+    axes[0].legend(fontsize=8)
+    return figure
 
 
 def film() -> list[tuple[str, str, str]]:

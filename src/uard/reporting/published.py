@@ -20,6 +20,7 @@ import numpy as np
 
 from uard import __version__, calibration, statistics
 from uard.envs.spec import Tables
+from uard.lab import examine
 from uard.lab.cell import RESULTS, Cell
 from uard.lab.result import TABLES, Result
 from uard.lab.store import Store
@@ -79,6 +80,11 @@ def _of_cell(studies: set[str], cell: Cell, found: dict[int, Result]) -> dict[st
         derived["largest"] = [_short(t.adjusted[t.counts].max()) for t in traces]
         derived["mean_inside"] = [_short(t.adjusted[t.counts].mean()) for t in traces]
         derived["trace"] = [[_short(x) for x in column] for column in traces[0][:4]]
+    if "mujoco-standard-distortion" in studies:
+        for name in ("perturbed", "warning"):
+            derived[name] = [[_short(x) for x in r.extra[name].ravel()] for r in results]
+        derived["reaction"] = [[_short(x) for x in examine.reaction(r.extra["trace"])] for r in results]
+        derived["trace"] = [[_short(x) for x in column] for column in results[0].extra["trace"].T]
     return out | ({"derived": derived} if derived else {})
 
 

@@ -1,8 +1,8 @@
-"""Hopper and Walker2d with a reward that lies (H4, H11, H12; G6, G7, G10, G11), in three sizes."""
+"""Hopper and Walker2d with a reward that lies (H4, H11-H16; G6, G7, G10-G15), in three sizes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from uard.agents.policy import PolicyGradient
@@ -11,6 +11,7 @@ from uard.lab.cell import Cell
 from uard.lab.names import continuous_agents
 from uard.lab.study import Row, Study, row
 from uard.mitigation import named
+from uard.networks import Ensemble
 from uard.studies.paper import PANELS, RAW
 
 REGIONS = {"vibration": Vibration, "posture": Posture}
@@ -144,6 +145,27 @@ def ablation(scale: Scale) -> tuple[Row, ...]:
     )
 
 
+def distortion(scale: Scale) -> tuple[Row, ...]:
+    """Agents trained on the true reward, whose reward is distorted afterwards (``uard.lab.examine``)."""
+    honest = Locomotion(region=None, reference=True)
+    every = continuous_agents(scale.small)
+    full = replace(every["ensemble-sac"], ensemble=Ensemble("full", 5))
+    return tuple(
+        row(
+            _cell(honest, mitigation, agent, scale.steps if agent is every["ppo"] else scale.critic_steps),
+            agent=name,
+            critics=critics,
+        )
+        for name, critics, agent, mitigation in (
+            ("uard", "5, shared trunk", every["ensemble-sac"], named("uard")),
+            ("uard", "5, full", full, named("uard")),
+            ("uard (ppo)", "5, shared trunk", every["ppo"], named("uard")),
+            ("edac", "5, full", every["edac"], RAW),
+            ("sunrise", "5, shared trunk", every["sunrise"], RAW),
+        )
+    )
+
+
 def studies(scale: Scale) -> tuple[Study, ...]:
     """Return the studies of a size."""
     of = f"mujoco-{scale.name}"
@@ -153,4 +175,10 @@ def studies(scale: Scale) -> tuple[Study, ...]:
         Study(f"{of}-noise", f"Violations against noise, {scale.name}", "H11, G11, J25", noise(scale)),
         Study(f"{of}-kick", f"A kick at step 500, {scale.name}", "H12, G10", kick(scale)),
         Study(f"{of}-ablation", f"Which source does the work in MuJoCo, {scale.name}", "H8", ablation(scale)),
+        Study(
+            f"{of}-distortion",
+            f"A distorted reward after training in MuJoCo, {scale.name}",
+            "H13-H16, G12-G15",
+            distortion(scale),
+        ),
     )

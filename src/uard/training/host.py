@@ -202,7 +202,38 @@ def record(job: Job, reservoir: Reservoir, steps: list[Moved], inputs: np.ndarra
     transitions.keep(reservoir, inputs[rated], said[rated], random, job.ddof)
 
 
-Advance = Callable[[Live, Physics], Live]
+class Loop(NamedTuple):
+    """How a run starts, how it advances by a piece, and what its agent does and believes.
+
+    Attributes:
+        copies: Of the robot.
+        start: Gives the first state.
+        advance: Trains one piece.
+        act: The most likely actions at observations (B, features): (B, motors), not clipped.
+        values: All critics' opinions of observations' values under those actions, (N, B).
+    """
+
+    copies: int
+    start: Callable[[Physics], Live]
+    advance: Callable[[Live, Physics], Live]
+    act: Callable[[Live, np.ndarray], np.ndarray]
+    values: Callable[[Live, np.ndarray], np.ndarray]
+
+
+def bind(job: Job) -> Loop:
+    """Return a run's loop.
+
+    Raises:
+        InvalidValueError: the agent cannot move motors.
+    """
+    from uard.training import host_off_policy, host_on_policy
+
+    if isinstance(job.agent, PolicyGradient):
+        return host_on_policy.bind(job)
+    if isinstance(job.agent, ContinuousActorCritic):
+        return host_off_policy.bind(job)
+    able = "one for continuous actions: PPO, TRPO, CPO, SAC, CQL, EDAC, SUNRISE"
+    raise _checks.InvalidValueError("agent", job.agent, able)
 
 
 def run(
@@ -228,26 +259,17 @@ def run(
             last good checkpoint is kept.
         CheckpointError: the checkpoint is truncated, or of another configuration.
     """
-    from uard.training import host_off_policy, host_on_policy
-
-    if isinstance(job.agent, PolicyGradient):
-        start, advance, act = host_on_policy.bind(job)
-        physics = Physics(job.spec, job.agent.envs, job.seed)
-    elif isinstance(job.agent, ContinuousActorCritic):
-        start, advance, act = host_off_policy.bind(job)
-        physics = Physics(job.spec, 1, job.seed)
-    else:
-        able = "one for continuous actions: PPO, TRPO, CPO, SAC, CQL, EDAC, SUNRISE"
-        raise _checks.InvalidValueError("agent", job.agent, able)
+    loop = bind(job)
+    physics = Physics(job.spec, loop.copies, job.seed)
     try:
-        live: Live = start(physics)
+        live = loop.start(physics)
         if path is not None and path.exists():
             live = checkpoint.load(path, config, live)
             physics.load(live.physics)
         saved = int(live.steps)
         while live.steps < job.steps:
             try:
-                live = advance(live, physics)
+                live = loop.advance(live, physics)
             except FloatingPointError as error:
                 raise FloatingPointError(f"{error} (environment step {int(live.steps)} of seed {job.seed})") from error
             if progress:
@@ -260,7 +282,7 @@ def run(
                 raise KeyboardInterrupt
     finally:
         physics.close()
-    return Done(live.log[:, :-1], live.log[:, -1], evaluate(job, live, act), live)
+    return Done(live.log[:, :-1], live.log[:, -1], evaluate(job, live, loop.act), live)
 
 
 def evaluate(job: Job, live: Live, act: Callable[[Live, np.ndarray], np.ndarray]) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,7 +15,7 @@ from uard.envs.mujoco import Physics
 from uard.feedback import transitions
 from uard.mitigation import Evidence, as_column
 from uard.training import host
-from uard.training.host import Book, Fixed, Job, Live, Norm
+from uard.training.host import Book, Fixed, Job, Live, Loop, Norm
 from uard.training.lanes import LOG
 
 PIECE = 32  # steps between calls of the compiled update
@@ -40,8 +39,8 @@ class Kept(NamedTuple):
     usual: Any
 
 
-def bind(job: Job) -> tuple[Callable[[Physics], Live], host.Advance, Callable[[Live, np.ndarray], np.ndarray]]:
-    """Return how a run starts, how it advances, and how its agent acts without exploration."""
+def bind(job: Job) -> Loop:
+    """Return a run's loop; a piece is ``PIECE`` steps."""
     agent, spec = job.agent, job.spec
     width = 2 * spec.features + spec.actions + 1
     slots = min(agent.buffer, -(-job.steps // PIECE) * PIECE)
@@ -123,9 +122,12 @@ def bind(job: Job) -> tuple[Callable[[Physics], Live], host.Advance, Callable[[L
         )
 
     def act(live: Live, observations: np.ndarray) -> np.ndarray:
-        return np.asarray(agent.greedy(live.agent, jnp.asarray(observations, jnp.float32)))
+        return np.asarray(_greedy(live.agent, observations.astype(np.float32), agent=agent))
 
-    return start, advance, act
+    def values(live: Live, observations: np.ndarray) -> np.ndarray:
+        return np.asarray(_values(live.agent, observations.astype(np.float32), agent=agent))
+
+    return Loop(1, start, advance, act, values)
 
 
 def _known(reservoir: Any, width: int) -> tuple[Any, Any]:
@@ -135,6 +137,16 @@ def _known(reservoir: Any, width: int) -> tuple[Any, Any]:
 @partial(jax.jit, static_argnames="agent")
 def _act(state: Any, observation: Array, key: Array, *, agent: ContinuousActorCritic) -> Array:
     return agent.act(state, observation, key)
+
+
+@partial(jax.jit, static_argnames="agent")
+def _greedy(state: Any, observations: Array, *, agent: ContinuousActorCritic) -> Array:
+    return agent.greedy(state, observations)
+
+
+@partial(jax.jit, static_argnames="agent")
+def _values(state: Any, observations: Array, *, agent: ContinuousActorCritic) -> Array:
+    return agent.values(state, observations, agent.greedy(state, observations))
 
 
 @partial(jax.jit, static_argnames="job")

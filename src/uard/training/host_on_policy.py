@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -13,18 +12,18 @@ from jax import Array
 
 from uard import networks
 from uard.agents import heads
-from uard.agents.policy import Experience
+from uard.agents.policy import Experience, PolicyGradient
 from uard.envs.mujoco import Moved, Physics
 from uard.feedback import transitions
 from uard.mitigation import Evidence, as_column
 from uard.training import host
 from uard.training.deep import all_finite
-from uard.training.host import Book, Fixed, Job, Live, Norm
+from uard.training.host import Book, Fixed, Job, Live, Loop, Norm
 from uard.training.lanes import LOG
 
 
-def bind(job: Job) -> tuple[Callable[[Physics], Live], host.Advance, Callable[[Live, np.ndarray], np.ndarray]]:
-    """Return how a run starts, how it advances by a rollout, and how its agent acts without exploration."""
+def bind(job: Job) -> Loop:
+    """Return a run's loop; a piece is a rollout."""
     agent, spec = job.agent, job.spec
     copies, length = agent.envs, agent.rollout
     width = 2 * spec.features + spec.actions + 1
@@ -96,14 +95,28 @@ def bind(job: Job) -> tuple[Callable[[Physics], Live], host.Advance, Callable[[L
         )
 
     def act(live: Live, observations: np.ndarray) -> np.ndarray:
-        return np.asarray(heads.likeliest(heads.say(live.agent.policy, jnp.asarray(live.norm.of(observations)))))
+        return np.asarray(_likeliest(live.agent, live.norm.of(observations)))
 
-    return start, advance, act
+    def values(live: Live, observations: np.ndarray) -> np.ndarray:
+        key = host.key_of(job.seed, host.EVALUATION)  # of dropout
+        return np.asarray(_values(live.agent, live.norm.of(observations), key, agent=agent))
+
+    return Loop(copies, start, advance, act, values)
 
 
 @jax.jit
 def _act(state: Any, observations: Array, key: Array) -> Array:
     return heads.draw(heads.say(state.policy, observations), key)
+
+
+@jax.jit
+def _likeliest(state: Any, observations: Array) -> Array:
+    return heads.likeliest(heads.say(state.policy, observations))
+
+
+@partial(jax.jit, static_argnames="agent")
+def _values(state: Any, observations: Array, key: Array, *, agent: PolicyGradient) -> Array:
+    return agent.values(state, observations, key)
 
 
 @partial(jax.jit, static_argnames="job")

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import warnings
 from pathlib import Path
+from typing import Any
 
 _FLAG = "xla_backend_extra_options"
 _BOUND = "xla_cpu_small_while_loop_byte_threshold=10000000"
@@ -38,6 +39,24 @@ def keep_programs() -> None:
 
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 2.0)
+
+
+HELD = 16  # programs that a process keeps
+_held: set[Any] = set()
+
+
+def make_room(program: Any) -> None:
+    """Forget all compiled programs when this one would be one too many; call it before a program is compiled.
+
+    A program of a deep agent takes some 1500 memory mappings. Linux allows a process 65 530, and a study of fifty
+    programs in one process was ended by "LLVM ERROR: Unable to allocate section memory".
+    """
+    if program not in _held and len(_held) >= HELD:
+        import jax
+
+        jax.clear_caches()
+        _held.clear()
+    _held.add(program)
 
 
 def compile_small_loops_whole() -> None:

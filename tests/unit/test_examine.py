@@ -1,0 +1,129 @@
+"""What a trained agent makes of a distorted reward, and what its sigma_m knows: hand-made cases, real physics."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from uard import studies
+from uard.agents.continuous import edac, sunrise
+from uard.agents.policy import PPO
+from uard.envs.mujoco import Locomotion, Moved
+from uard.feedback.transitions import TransitionModel
+from uard.lab import examine, runner
+from uard.lab.cell import Cell
+from uard.lab.store import Store
+from uard.lab.study import Study, row
+from uard.mitigation import Raw, named
+from uard.networks import Ensemble, Network
+from uard.reporting import locomotion
+from uard.reporting.published import Published, extract
+from uard.training import host
+
+TINY = Network(16, 1e-3, 1.0)
+OFF = {"network": TINY, "batch": 32, "warmup": 64, "buffer": 500}
+ON = PPO(TINY, Ensemble("shared", 3), envs=4, rollout=32, epochs=1, count_bonus=0.0)
+SMALL = TransitionModel(hidden=8, fits=5, batch=16, capacity=64)
+WHERE = Locomotion(region=None, reference=True)
+
+
+def trained(agent, mitigation):
+    job = host.Job(WHERE, agent, mitigation, 1, 256, feedback=SMALL, evaluations=1)
+    return job, host.run(job).live
+
+
+def test_a_reaction_by_hand():
+    here = examine.inside()
+    assert here.sum() == 60
+    true = np.full(examine.STEPS, 2.0)
+    observed = true + examine.BONUS * here
+    doubled = np.where(here, 6.0, 3.0)
+    for adjusted, activations, believed in ((observed, 60, 1.0), (true, 0, 0.0), (true + 2.0 * here, 0, 0.5)):
+        trace = np.column_stack([observed, adjusted, observed, doubled, true])
+        assert examine.reaction(trace) == (activations, believed, 6.0, 3.0)
+
+
+def test_a_raw_agent_believes_everything_and_each_epsilon_costs_its_advantage_epsilon():
+    found = examine.examine(*trained(ON, Raw()))
+    observed, adjusted, caution, lam, true = found["trace"].T
+    np.testing.assert_array_equal(adjusted, observed)
+    np.testing.assert_array_equal(caution, observed)
+    assert not lam.any()
+    np.testing.assert_allclose(observed - true, examine.BONUS * examine.inside(), atol=1e-5)
+    filtered, raw, kept_filtered, kept_raw = found["perturbed"].T
+    np.testing.assert_array_equal(filtered, raw)
+    np.testing.assert_array_equal(kept_filtered, kept_raw)
+    np.testing.assert_allclose(raw, raw[0] - examine.EPSILONS, atol=1e-4)
+    assert kept_raw[0] == 1.0
+    assert raw[0] > 0
+
+
+def test_edac_takes_its_pessimism_off_and_sunrise_weighs():
+    observed, adjusted, *_ = examine.examine(*trained(edac(3, **OFF), Raw()))["trace"].T
+    assert (adjusted < observed).all()
+    observed, adjusted, *_ = examine.examine(*trained(sunrise(3, **OFF), Raw()))["trace"].T
+    share = adjusted / observed
+    assert (share > 0.5).all()
+    assert (share < 1.0).all()
+
+
+def test_what_a_random_action_would_do_leaves_no_trace_in_the_walk(monkeypatch):
+    job, live = trained(ON, named("uard"))
+    found = examine.examine(job, live)
+    monkeypatch.setattr(examine, "EVERY", 250)
+    np.testing.assert_array_equal(found["trace"], examine.examine(job, live)["trace"])
+    assert (found["trace"][:, examine.TRACE.index("lam")] > 0).all()
+    assert np.isfinite(found["perturbed"]).all()
+
+
+class Judge(SimpleNamespace):
+    """A judge of places 0 to 99 in a world of reward 1 and discount 0.5, with given values and doubts."""
+
+    job = SimpleNamespace(seed=0, agent=SimpleNamespace(gamma=0.5))
+
+    def __call__(self, steps, reward):
+        return reward, reward, reward
+
+    def value(self, observations):
+        return self.values[observations[:, 0].astype(int).clip(0, 99)]
+
+    def doubt(self, observations):
+        own = self.doubts[observations[:, 0].astype(int).clip(0, 99)]
+        return np.where(observations[:, 1] == 0.0, own, 9.0)
+
+
+def test_the_warning_knows_wrong_values_and_states_that_were_never_visited():
+    places = np.arange(100)
+    wrong = places >= 80
+    values = np.where(wrong, 5.0, 2.0)  # worth 1 / (1 - 0.5) = 2
+    at = np.column_stack([places, np.zeros(100)]).astype(float)
+    no = np.zeros(100, bool)
+    moved = Moved(np.zeros((100, 2)), np.ones(100), no, no, np.ones(100), no, np.ones(100))
+    walked = examine.Walked(at, np.zeros((100, 1)), moved)
+    for doubts, expected in ((wrong * 1.0, 1.0), (1.0 - wrong, 0.0), (np.ones(100), 0.5)):
+        _, error = examine._warning(Judge(values=values, doubts=doubts), walked)
+        assert error == pytest.approx(expected)
+    thrown, _ = examine._warning(Judge(values=values, doubts=np.zeros(100)), walked)
+    assert 0.6 < thrown < 0.9, "half are thrown off sideways, where it is in doubt; along the places it is not"
+
+
+def test_the_study_is_published_and_shown():
+    store = Store(":memory:")
+    agents = {
+        "uard": (ON, named("uard")),
+        "uard (ppo)": (ON, named("uard")),
+        "edac": (edac(3, **OFF), Raw()),
+        "sunrise": (sunrise(3, **OFF), Raw()),
+    }
+    rows = tuple(
+        row(Cell(WHERE, mitigation, agent, steps=256, feedback=SMALL, rated=0.1 * i), agent=name, critics="3")
+        for i, (name, (agent, mitigation)) in enumerate(agents.items())
+    )
+    study = Study(locomotion.DISTORTION, "t", "G12", rows)
+    runner.run([(r.cell, 0) for r in rows], store, workers=1)
+    data = extract((study,), store, [0], "made so")
+    others = [s for s in studies.every() if s.name != study.name]
+    published = Published((*others, study), [data])
+    (table,) = (t for t in locomotion.tables(published) if "distorted" in t.title)
+    assert [r[0] for r in table.rows] == list(agents)
+    assert len(locomotion.drawn(published)) == 3
