@@ -71,6 +71,9 @@ class Run:
     """The same as a fraction of the trap's reward (instead of --noise)."""
     rated: float = 1.0
     """Fraction of steps that are rated."""
+    query: str = "random"
+    """Which steps are rated: random, or (Hopper and Walker2d) doubtful: half of them where the raters' model knows
+    least."""
     feedback: str | None = None
     """How a deep agent knows of ratings: model (learned; what is taken if left out) or table (running means)."""
     episodes: int = 500
@@ -353,6 +356,7 @@ def _run(command: Run, console: Console) -> None:
         command.episodes,
         feedback=names.feedback(command.feedback, agent, environment),
         steps=command.steps,
+        query=command.query,
     )
     store = Store(command.store or ":memory:")
     seeds = range(command.seeds)

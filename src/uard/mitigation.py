@@ -241,7 +241,8 @@ class RewardDiscounting(Mitigation):
         acts_on: ``reward``: learn from b + w (r - b) (T_lambda, A21); ``score``: learn from the raw reward and act
             on J (A19, A38); ``both``.
         anchor: ``zero`` as printed, or ``lowest``: the running mean of the lowest rating for rewards, the
-            worst action's value for scores.
+            worst action's value for scores; of a state that offers one action, as a continuous agent's do, the
+            ensemble's lower bound mu - sigma_m.
         kappa: Gain of the adaptive lambda_t (A44) >= 0; 0 keeps lambda constant.
         proxy_is_rater: Count the observed reward as one more rater in sigma_h.
         standardise: Measure sigmas in units of the running scale of the observed reward.
@@ -331,7 +332,10 @@ class RewardDiscounting(Mitigation):
         if self.acts_on == "reward":
             return mu
         xp = namespace(mu)
-        anchor = xp.zeros_like(mu) if self.anchor == "zero" else xp.min(mu, axis=-1, keepdims=True)
+        if self.anchor == "zero":
+            anchor = xp.zeros_like(mu)
+        else:
+            anchor = mu - sigma_m if mu.shape[-1] == 1 else xp.min(mu, axis=-1, keepdims=True)
         return discount(mu, self.weight(mu - anchor, feedback.proxy, sigma_m, feedback, usual), anchor)
 
 

@@ -37,6 +37,8 @@ def test_version():
     for option in ("--version", "-V"):
         done = uard(option)
         assert (done.returncode, done.stdout, done.stderr) == (0, f"uard {__version__}\n", "")
+    module = subprocess.run([sys.executable, "-m", "uard", "--version"], capture_output=True, text=True)
+    assert module.stdout == f"uard {__version__}\n"
 
 
 @pytest.mark.parametrize(

@@ -127,6 +127,28 @@ def test_kill_minus_nine_at_any_moment(agent, tmp_path):
     assert kills == 3
 
 
+def test_half_of_what_is_rated_is_what_the_model_knows_least():
+    knows = np.arange(1000.0)
+    random = np.random.default_rng(0)
+    asked = [transitions.chosen("doubtful", 0.2, lambda: knows, 1000, random) for _ in range(50)]
+    share = np.mean(asked, 0)
+    assert share.mean() == pytest.approx(0.2, abs=0.01)
+    assert share[:80].mean() > 0.9
+    assert share[200:].mean() == pytest.approx(0.1, abs=0.02)
+    assert not transitions.chosen("doubtful", 0.0, lambda: knows, 1000, random).any()
+    assert transitions.chosen("doubtful", 1.0, lambda: knows, 1000, random).all()
+    never = pytest.fail
+    blind = transitions.chosen("random", 0.2, lambda: never("the model was asked"), 1000, random)
+    assert blind.mean() == pytest.approx(0.2, abs=0.05)
+
+
+def test_doubtful_steps_are_rated_in_both_loops_and_as_many():
+    for agent in ("ppo", "ensemble-sac"):
+        one, other = (host.run(job(agent, rated=0.3, query=q)) for q in ("random", "doubtful"))
+        assert not np.array_equal(one.live.reservoir.inputs, other.live.reservoir.inputs)
+        assert other.live.reservoir.seen[0] == pytest.approx(0.3 * other.live.steps, rel=0.25)
+
+
 def test_a_state_that_is_not_finite_stops_the_run_and_the_last_good_one_stays(tmp_path, monkeypatch):
     path = tmp_path / "run"
     from uard.training import host_on_policy

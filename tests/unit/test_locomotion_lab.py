@@ -39,7 +39,9 @@ def test_a_cell_knows_what_matters_of_it():
     assert cell(steps=513).key != cell().key
     assert cell(steps=None).steps == 1_000_000
     assert cell(environment=dataclasses.replace(WHERE, version=5)).key != cell().key
-    raw = cell(mitigation=Raw(), panel="appendix", rated=0.5)
+    assert cell(query="doubtful").key != cell().key
+    assert "query" not in cell().config(), "keys of earlier cells are what they were"
+    raw = cell(mitigation=Raw(), panel="appendix", rated=0.5, query="doubtful")
     assert raw.key == cell(mitigation=Raw()).key, "nobody is asked"
     assert "steps" not in Cell().config(), "keys of the grids' cells are what they were"
 
@@ -53,6 +55,11 @@ def test_a_cell_knows_what_matters_of_it():
         ({"environment": TrapGrid(), "agent": QLearning(), "steps": 10}, "episodes"),
         ({"feedback": RatingModel()}, "TransitionModel"),
         ({"steps": 0}, "steps"),
+        ({"query": "sometimes"}, "random"),
+        (
+            {"environment": TrapGrid(), "agent": QLearning(), "steps": None, "query": "doubtful"},
+            "random but",
+        ),
     ],
 )
 def test_pairs_that_cannot_work_are_refused_with_those_that_can(changes, says):

@@ -8,7 +8,7 @@ import pytest
 import uard.mitigation
 from uard import Evidence, Feedback, LearningSignal, Mitigation, ReliabilityFilter, RewardDiscounting
 from uard._checks import InvalidValueError, UnknownNameError
-from uard.mitigation import NAMED, RatedReward, Raw, Screening, Usual, measure_usual, named
+from uard.mitigation import NAMED, RatedReward, Raw, Screening, Usual, as_column, measure_usual, named
 from uard.reliability import FORMS
 from uard.uncertainty import Spread
 
@@ -112,6 +112,15 @@ def test_score_by_hand(changes, expected, unrated):
     np.testing.assert_allclose(scored(named("uard-paper", **changes), table=rated), expected)
     silent = TABLE._replace(count=np.zeros(4))
     np.testing.assert_allclose(scored(named("uard-paper", **changes), table=silent), unrated)
+
+
+def test_the_score_of_an_only_action_is_drawn_towards_the_ensembles_lower_bound():
+    rated = TABLE._replace(count=np.ones(4))
+    mitigation = named("uard-paper", anchor="lowest")
+    got = mitigation.score(MU[:, None], SIGMA_M[:, None], as_column(rated), USUAL)[:, 0]
+    weight = 1 / (1 + 2 * 0.5 * (SIGMA_M + TABLE.spread))
+    np.testing.assert_allclose(got, MU - SIGMA_M + weight * SIGMA_M)
+    assert (got[1:] < MU[1:]).all()
 
 
 def test_usual_is_over_what_was_rated():

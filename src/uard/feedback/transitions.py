@@ -8,6 +8,7 @@ observed, which tells hacks apart far better than a predicted spread.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -23,6 +24,7 @@ from uard.mitigation import Feedback, Mitigation
 from uard.networks import Layer, descend, mlp, through
 
 SAID = ("mean", "lowest", "spread")
+QUERIES = ("random", "doubtful")  # which steps are rated
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,28 @@ def keep(kept: Reservoir, inputs: np.ndarray, ratings: np.ndarray, random: np.ra
     kept.seen[0] += len(inputs)
 
 
+def chosen(query: str, share: float, knows: Callable[[], np.ndarray], rows: int, random: np.random.Generator) -> Any:
+    """Return which of some steps are to be rated, (rows,) of bool, a ``share`` of them on average.
+
+    Args:
+        query: ``random``, each by itself; or ``doubtful``: half of them at random, so that the usual is not forgotten,
+            half where the model knows least (active learning).
+        share: In [0, 1].
+        knows: Gives how many ratings the model's predictions are worth, (rows,); asked only if that matters.
+        rows: How many steps.
+        random: Source of chance.
+    """
+    if query == "random":
+        return random.random(rows) < share
+    number = random.binomial(rows, share)
+    order = random.permutation(rows)
+    blind, rest = order[: number - number // 2], order[number - number // 2 :]
+    least = rest[np.argsort(knows()[rest], kind="stable")[: number // 2]]
+    out = np.zeros(rows, bool)
+    out[np.concatenate([blind, least])] = True
+    return out
+
+
 class Model(NamedTuple):
     """Layers, Adam's moments, and the units: location and scale of the inputs, location of what was said, its scale."""
 
@@ -140,6 +164,12 @@ def read(spec: TransitionModel, model: Model, inputs: Array, raters: int) -> Fee
     count = jnp.maximum(before / jnp.maximum(after, 1e-6) - 1.0, 0.0)
     mean, lowest, spread = jnp.moveaxis(model.location + model.scale * out.mean(0), -1, 0)
     return Feedback(count, mean, lowest, jnp.maximum(spread, 0.0), inputs[:, -1], jnp.asarray(raters, jnp.float32))
+
+
+@partial(jax.jit, static_argnames="spec")
+def worth(spec: TransitionModel, model: Model, inputs: Array) -> Array:
+    """Return ``read``'s count alone, (B,)."""
+    return read(spec, model, inputs, 1).count
 
 
 def nothing(rows: int, raters: int) -> Feedback:

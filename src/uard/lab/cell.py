@@ -18,7 +18,7 @@ from uard.envs.panels import PANELS
 from uard.envs.spec import Spec
 from uard.envs.trapgrid import TrapGrid
 from uard.feedback.learned import RatingModel
-from uard.feedback.transitions import TransitionModel
+from uard.feedback.transitions import QUERIES, TransitionModel
 from uard.lab import names
 from uard.mitigation import Mitigation, Raw
 
@@ -44,6 +44,8 @@ class Cell:
         feedback: How a deep agent knows of ratings: a model of them, or running means per state-action if None (which a
             tabular agent always has). For a ``Locomotion`` always a model of transitions.
         steps: Environment steps, for a ``Locomotion`` only; 1 000 000 if None.
+        query: Which steps are rated: ``random``, or half of them where the model of ratings knows least (``doubtful``;
+            for a ``Locomotion`` only).
     """
 
     environment: Any = field(default_factory=TrapGrid)
@@ -57,6 +59,7 @@ class Cell:
     snapshots: int = 0
     feedback: RatingModel | TransitionModel | None = None
     steps: int | None = None
+    query: str = "random"
 
     def __post_init__(self) -> None:
         """Check everything; forget what cannot matter.
@@ -71,6 +74,7 @@ class Cell:
         _checks.whole("episodes", self.episodes, low=1, high=1_000_000)
         _checks.whole("ddof", self.ddof, low=0, high=1)
         _checks.whole("snapshots", self.snapshots, low=0, high=1000)
+        _checks.choose("query", self.query, QUERIES)
         for name, kind in (("environment", Spec | Locomotion), ("mitigation", Mitigation), ("agent", names.Agent)):
             value = getattr(self, name)
             if not isinstance(value, kind) or not _checks.is_frozen(value):
@@ -86,6 +90,8 @@ class Cell:
                 object.__setattr__(self, "feedback", TransitionModel())
         elif self.steps is not None:
             raise _checks.InvalidValueError("steps", self.steps, "left out but for Hopper and Walker2d; see episodes")
+        elif self.query != "random":
+            raise _checks.InvalidValueError("query", self.query, "random but for Hopper and Walker2d")
         if isinstance(self.agent, QLearning):
             if self.feedback is not None:
                 raise _checks.InvalidValueError(
@@ -99,16 +105,17 @@ class Cell:
                 raise _checks.InvalidValueError("feedback", self.feedback, f"a {wanted.__name__} or none")
             object.__setattr__(self, "feedback", _settled("feedback", self.feedback))
         if not self.mitigation.reads_feedback:
-            for name, value in (("panel", "main"), ("noise", 0.0), ("rated", 1.0), ("feedback", None)):
+            unheard = {"panel": "main", "noise": 0.0, "rated": 1.0, "feedback": None, "query": "random"}
+            for name, value in unheard.items():
                 object.__setattr__(self, name, value)
         for name, kind in (("noise", float), ("rated", float), ("episodes", int), ("ddof", int), ("snapshots", int)):
             object.__setattr__(self, name, kind(getattr(self, name)))
 
     def config(self) -> dict[str, Any]:
-        """Return the whole configuration as plain data; without ``feedback`` and ``steps`` where they are none."""
+        """Return the whole configuration as plain data; without what came later where it is left out."""
         config = plain(self)
-        for name in ("feedback", "steps"):
-            if config[name] is None:
+        for name, left_out in (("feedback", None), ("steps", None), ("query", "random")):
+            if config[name] == left_out:
                 del config[name]
         return config
 

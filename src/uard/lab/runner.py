@@ -172,6 +172,7 @@ def _train_host(cell: Cell, seed: int, folder: Path | None) -> Result:
         cell.rated,
         cell.feedback if isinstance(cell.feedback, TransitionModel) else TransitionModel(),
         cell.ddof,
+        query=cell.query,
     )
     path = None if folder is None else checkpoint_of(folder, cell, seed)
     return finish_host(job, host.run(job, path, f"{cell.key} {seed}"))

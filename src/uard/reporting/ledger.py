@@ -629,6 +629,16 @@ _DISTORTED = "study deep-distortion: +1.5 on the reward for 60 of 1000 steps; de
 _UNEQUAL = "EDAC and SUNRISE read no ratings and cannot know of the lie, so it is no fair fight."
 
 
+def _on_hopper() -> str:
+    """Say how many exploit activations the same study counts in MuJoCo, if it is published."""
+    p = published.packaged()
+    counts = [
+        f"{r['agent']} {brief_ci(statistics.summarise(p.derived(r, 'reaction')[:, 0]))}"
+        for r in p.rows(locomotion.DISTORTION)
+    ]
+    return f" On Hopper (mujoco-standard-distortion), of 60: {', '.join(counts)}." if counts else ""
+
+
 @_claim("J22")
 def _j22(e: Evidence) -> _Answer:
     count = _distorted("activations")
@@ -636,7 +646,7 @@ def _j22(e: Evidence) -> _Answer:
         return _UNPUBLISHED
     cut = 100 * (1 - count["uard"].mean / count["edac"].mean) if count["edac"].mean else 0.0
     text = f"uard {brief_ci(count['uard'])}, EDAC {brief_ci(count['edac'])} activations: {_percent(cut)} fewer"
-    return _DISTORTED, text, _verdict(int(cut >= 92.0), 1), _UNEQUAL
+    return _DISTORTED, text, _verdict(int(cut >= 92.0), 1), _UNEQUAL + _on_hopper()
 
 
 @_claim("J23")

@@ -20,7 +20,7 @@ from uard.agents.policy import PolicyGradient
 from uard.envs import mujoco, panels
 from uard.envs.mujoco import Locomotion, Moved, Physics
 from uard.feedback import transitions
-from uard.feedback.transitions import Reservoir, TransitionModel
+from uard.feedback.transitions import QUERIES, TransitionModel
 from uard.mitigation import Mitigation
 from uard.training import checkpoint
 from uard.training.lanes import LOG
@@ -44,6 +44,7 @@ class Job:
         feedback: The model of the ratings.
         ddof: Of the annotators' deviation.
         evaluations: Episodes without exploration after training.
+        query: Which steps are rated; see ``transitions.chosen``.
     """
 
     spec: Locomotion
@@ -57,6 +58,7 @@ class Job:
     feedback: TransitionModel = field(default_factory=TransitionModel)
     ddof: int = 0
     evaluations: int = 8
+    query: str = "random"
 
     def __post_init__(self) -> None:
         """Check the parameters."""
@@ -64,6 +66,7 @@ class Job:
         _checks.whole("steps", self.steps, low=1, high=10**12)
         _checks.number("rated", self.rated, low=0, high=1)
         _checks.whole("evaluations", self.evaluations, low=1, high=1000)
+        _checks.choose("query", self.query, QUERIES)
 
     @property
     def listens(self) -> bool:
@@ -194,12 +197,17 @@ class Book:
         return np.concatenate([log, np.array(self.rows).reshape(-1, len(LOG) + 1)])
 
 
-def record(job: Job, reservoir: Reservoir, steps: list[Moved], inputs: np.ndarray, number: int) -> None:
+def record(job: Job, live: Live, steps: list[Moved], inputs: np.ndarray, number: int) -> None:
     """Put the rated fraction of (T, E) steps to the panel, and keep what it says."""
     random = generator(job.seed, PANEL, number)
-    rated = random.random(inputs.shape[:2]) < job.rated
+    flat = inputs.reshape(-1, inputs.shape[-1])
+
+    def knows() -> np.ndarray:
+        return np.asarray(transitions.worth(job.feedback, live.model, flat))
+
+    rated = transitions.chosen(job.query, job.rated, knows, len(flat), random).reshape(inputs.shape[:2])
     said = np.stack([mujoco.rate(job.panel, moved, job.noise, random) for moved in steps])
-    transitions.keep(reservoir, inputs[rated], said[rated], random, job.ddof)
+    transitions.keep(live.reservoir, inputs[rated], said[rated], random, job.ddof)
 
 
 class Loop(NamedTuple):

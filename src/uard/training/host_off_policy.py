@@ -93,7 +93,7 @@ def bind(job: Job) -> Loop:
         model, usual = live.model, live.extra.usual
         if job.listens:
             told = transitions.features(row.observation, row.action, row.following, row.reward)
-            host.record(job, live.reservoir, steps, told[:, None], number)
+            host.record(job, live, steps, told[:, None], number)
             if number % FIT_EVERY == FIT_EVERY - 1:
                 key = host.key_of(job.seed, host.MODEL, number + 1)
                 model = transitions.fit(job.feedback, model, *live.reservoir[:2], live.reservoir.seen[0], key)

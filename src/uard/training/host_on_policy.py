@@ -64,7 +64,7 @@ def bind(job: Job) -> Loop:
         ).astype(np.float32)
         model, reservoir = live.model, live.reservoir
         if job.listens:
-            host.record(job, reservoir, steps, told, number)
+            host.record(job, live, steps, told, number)
             key = host.key_of(job.seed, host.MODEL, number + 1)
             model = transitions.fit(job.feedback, model, *reservoir[:2], reservoir.seen[0], key)
         learner, fine = _learn(
