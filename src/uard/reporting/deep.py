@@ -150,6 +150,12 @@ def losses(p: Published) -> list[str]:
                     f"With {100 * r['rated']:g} % of steps rated, the learned model of the ratings does worse than a table of running "
                     f"means: {full(learned)} against {full(table)}. Here it extrapolates what few ratings do not support."
                 )
+    for r in (*p.rows("deep-rivals", mitigation="uard"), *p.rows("deep-feedback")):
+        goals = p.per_seed(r, "goal_rate")
+        if lost := int((goals < 0.5).sum()):
+            where = ", ".join(f"{100 * v:g} % rated" if k == "rated" else str(v) for k, v in r.labels if v != "uard")
+            noisy = ", very noisy raters" if "panel" in dict(r.labels) else ""
+            out.append(f"uard lost the goal in {lost} of {len(goals)} runs with {where}{noisy}.")
     games = p.rows("gaming", mitigation="uard")
     beaten = []
     for r in games:
