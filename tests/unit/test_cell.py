@@ -104,7 +104,7 @@ class Thawed(Mitigation):
 
 
 def test_every_field_is_tried_below():
-    assert set(leaves(FULL)) | {"agent.abstention"} == set(CHANGED) | {"feedback", "steps"}, (
+    assert set(leaves(FULL)) | {"agent.abstention"} == set(CHANGED) | {"feedback", "steps", "query"}, (
         "test_deep_lab, test_locomotion_lab"
     )
 
@@ -202,7 +202,7 @@ def test_the_configuration_is_plain_data_that_names_its_classes():
     assert config["mitigation"]["class"] == "uard.mitigation.RewardDiscounting"
     assert config["mitigation"]["filter"]["lam"] == 0.2
     assert config["environment"]["traps"] == [[3, 3]]
-    assert config | {"feedback": None, "steps": None} == plain(FULL)
+    assert config | {"feedback": None, "steps": None, "query": "random"} == plain(FULL)
 
 
 def test_keys_are_the_same_in_every_process_and_release():

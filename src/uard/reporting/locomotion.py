@@ -18,6 +18,7 @@ from uard.reporting.tables import Table, full
 
 HACKING, NOISE, KICK = "mujoco-standard-hacking", "mujoco-standard-noise", "mujoco-standard-kick"
 DISTORTION = "mujoco-standard-distortion"
+AS_GOOD = 0.03  # by how much the AUROC of a cheaper sigma_m may be lower
 REMOVED, KEPT, COST = 0.936, 0.9, 0.05  # the paper's best reduction (J16); what is asked of a filter beside it
 METRICS = ("trap_visits", "true_return", "observed_return")
 COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", "uard": "#2c6fbb"}
@@ -29,7 +30,8 @@ def tables(p: Published) -> list[Table]:
 
 
 def _steps(p: Published, study: str) -> str:
-    return f"{p.rows(study)[0].cell.steps:,} steps, {p.seeds(study)} seeds" if p.rows(study) else ""
+    budgets = " or ".join(f"{n:,}" for n in sorted({r.cell.steps or 0 for r in p.rows(study)}))
+    return f"{budgets} steps, {p.seeds(study)} seeds" if budgets else ""
 
 
 def _hacking(p: Published) -> Table:
@@ -138,6 +140,30 @@ def _distortion(p: Published) -> Table:
 
 def losses(p: Published) -> list[str]:
     """Say where ``uard`` misses what is asked of it in MuJoCo, found by rule."""
+    return _of_hacking(p) + _of_distortion(p)
+
+
+def _of_distortion(p: Published) -> list[str]:
+    rows = {r["critics"]: r for r in p.rows(DISTORTION, agent="uard")}
+    out = []
+    if len(rows) == 2:
+        shared, full_ones = (
+            [statistics.summarise(c) for c in p.derived(rows[k], "warning").T] for k in ("5, shared trunk", "5, full")
+        )
+        worse = [
+            f"{what} {full(a)} against {full(b)}"
+            for what, a, b in zip(("states thrown off", "wrong values"), shared, full_ones, strict=True)
+            if b.mean - a.mean > AS_GOOD
+        ]
+        if worse:
+            out.append(
+                f"MuJoCo: sigma_m of five critics on one trunk warns worse than that of five full ones (AUROC, by more "
+                f"than {AS_GOOD:g}): {'; '.join(worse)}."
+            )
+    return out
+
+
+def _of_hacking(p: Published) -> list[str]:
     ours = [r for r in p.rows(HACKING, mitigation="uard")]
     if not ours:
         return []
@@ -216,6 +242,12 @@ def _traced(p: Published, agent: str) -> np.ndarray:
     return p.derived(r, "trace")
 
 
+def _legend_below(axis: Any) -> None:
+    low, high = axis.get_ylim()
+    axis.set_ylim(bottom=low - 0.35 * (high - low))
+    axis.legend(loc="lower right")
+
+
 def _adjusted(p: Published) -> Figure:
     figure, axes = figures._axes(2, 6.2, 3.8)
     _shaded(axes)
@@ -223,7 +255,7 @@ def _adjusted(p: Published) -> Figure:
         axis.plot(_traced(p, rival)[1], color="#c1272d", lw=1, label=rival)
         axis.plot(_traced(p, "uard")[1], color=COLOURS["uard"], lw=1.2, label="ensemble-sac + uard")
         axis.set(ylabel="confidence-adjusted reward")
-        axis.legend(loc="lower right")
+        _legend_below(axis)
     return figure
 
 
@@ -238,7 +270,7 @@ def _windows(p: Published) -> Figure:
     ):
         axes[0].plot(values, color=colour, lw=1, label=label)
     axes[0].set(ylabel="effective reward")
-    axes[0].legend(loc="lower right")
+    _legend_below(axes[0])
     axes[1].plot(lam, color=COLOURS["uard"], lw=1)
     axes[1].set(ylabel="lambda_t", yscale="log")
     return figure
