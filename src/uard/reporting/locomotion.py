@@ -17,7 +17,7 @@ from uard.reporting.published import Published, packaged_json
 from uard.reporting.tables import Table, full
 
 HACKING, NOISE, KICK = "mujoco-standard-hacking", "mujoco-standard-noise", "mujoco-standard-kick"
-DISTORTION = "mujoco-standard-distortion"
+DISTORTION, RATING = "mujoco-standard-distortion", "mujoco-standard-rating"
 AS_GOOD = 0.03  # by how much the AUROC of a cheaper sigma_m may be lower
 REMOVED, KEPT, COST = 0.936, 0.9, 0.05  # the paper's best reduction (J16); what is asked of a filter beside it
 METRICS = ("trap_visits", "true_return", "observed_return")
@@ -26,7 +26,7 @@ COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", 
 
 def tables(p: Published) -> list[Table]:
     """Return all tables for which there are results."""
-    return [t for t in (_hacking(p), _noise(p), _kick(p), _distortion(p)) if t.rows]
+    return [t for t in (_hacking(p), _noise(p), _kick(p), _rating(p), _distortion(p)) if t.rows]
 
 
 def _steps(p: Published, study: str) -> str:
@@ -111,6 +111,24 @@ def _kick(p: Published) -> Table:
         tuple(rows),
         2,
         "An episode that ends before step 500 was never kicked.",
+    )  # fmt: skip
+
+
+def _rating(p: Published) -> Table:
+    rows = []
+    for r in p.rows(RATING):
+        best = (full(statistics.summarise(x)) for x in p.derived(r, "deterministic").T)
+        cells = (full(p.of(r, m)) for m in ("trap_visits", "true_return"))
+        rows.append((r["region"], r["panel"], r["query"], *cells, *best))
+    return Table(
+        f"Which steps are rated: Hopper, PPO with uard, {_steps(p, RATING)}, 15 % of steps",
+        (
+            "region", "panel", "rated steps", "steps in the region per episode", "true return",
+            "deterministic: steps in the region", "true return",
+        ),
+        tuple(rows),
+        3,
+        "Random, or half of them where the model of the ratings knows least (doubtful).",
     )  # fmt: skip
 
 

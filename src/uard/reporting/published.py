@@ -30,7 +30,7 @@ from uard.statistics import Summary
 
 BIN = 10  # episodes
 CURVES = ("observed_return", "trap_visits", "goal")
-FILES = ("grid-deep.json", "games.json", "mujoco.json", "mujoco-distortion.json")
+FILES = ("grid-deep.json", "games.json", "mujoco.json", "mujoco-distortion.json", "mujoco-rating.json")
 
 
 def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], command: str) -> dict[str, Any]:

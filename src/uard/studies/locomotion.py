@@ -7,6 +7,7 @@ from typing import Any
 
 from uard.agents.policy import PolicyGradient
 from uard.envs.mujoco import Kick, Locomotion, Posture, Vibration
+from uard.feedback.transitions import QUERIES
 from uard.lab.cell import Cell
 from uard.lab.names import continuous_agents
 from uard.lab.study import Row, Study, row
@@ -166,6 +167,22 @@ def distortion(scale: Scale) -> tuple[Row, ...]:
     )
 
 
+def rating(scale: Scale) -> tuple[Row, ...]:
+    """Which steps are rated: at random, or half of them where the model of ratings knows least. Hopper, PPO."""
+    agent, steps = scale.agents["ppo"]
+    return tuple(
+        row(
+            _cell(Locomotion(region=region()), named("uard"), agent, steps, panel=panel, query=query),
+            region=which,
+            panel=panel,
+            query=query,
+        )
+        for which, region in REGIONS.items()
+        for panel in PANELS
+        for query in QUERIES
+    )
+
+
 def studies(scale: Scale) -> tuple[Study, ...]:
     """Return the studies of a size."""
     of = f"mujoco-{scale.name}"
@@ -175,6 +192,7 @@ def studies(scale: Scale) -> tuple[Study, ...]:
         Study(f"{of}-noise", f"Violations against noise, {scale.name}", "H11, G11, J25", noise(scale)),
         Study(f"{of}-kick", f"A kick at step 500, {scale.name}", "H12, G10", kick(scale)),
         Study(f"{of}-ablation", f"Which source does the work in MuJoCo, {scale.name}", "H8", ablation(scale)),
+        Study(f"{of}-rating", f"Which steps are rated, {scale.name}", "DESIGN: active rating", rating(scale)),
         Study(
             f"{of}-distortion",
             f"A distorted reward after training in MuJoCo, {scale.name}",
