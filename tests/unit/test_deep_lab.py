@@ -16,7 +16,7 @@ from uard.envs.gaming import BoatRace, TomatoWatering
 from uard.envs.learned_reward import LearnedRewardGrid
 from uard.envs.trapgrid import TrapGrid
 from uard.feedback.learned import RatingModel
-from uard.lab import names, runner
+from uard.lab import examine, names, runner
 from uard.lab.cell import Cell
 from uard.lab.store import Store
 from uard.lab.study import Study, row
@@ -145,9 +145,9 @@ def test_what_is_packaged_belongs_to_the_present_definitions():
 
 
 def test_distortion_counts_only_windows_and_never_the_goal():
-    assert distortion.inside().sum() == 60
-    zero = np.zeros(distortion.STEPS)
-    everywhere = distortion.Trace(zero, zero + 1.0, zero, zero, distortion.inside())
+    assert examine.inside().sum() == 60
+    zero = np.zeros(examine.STEPS)
+    everywhere = distortion.Trace(zero, zero + 1.0, zero, zero, examine.inside())
     assert distortion.activations(everywhere) == 60
     assert distortion.activations(everywhere._replace(adjusted=zero + distortion.THRESHOLD)) == 0
     assert distortion.activations(everywhere._replace(counts=zero.astype(bool))) == 0

@@ -104,7 +104,7 @@ def chosen(query: str, share: float, knows: Callable[[], np.ndarray], rows: int,
 
     Args:
         query: ``random``, each by itself; or ``doubtful``: half of them at random, so that the usual is not forgotten,
-            half where the model knows least (active learning).
+            half where the model knows least (uncertainty sampling).
         share: In [0, 1].
         knows: Gives how many ratings the model's predictions are worth, (rows,); asked only if that matters.
         rows: How many steps.

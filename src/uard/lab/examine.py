@@ -57,6 +57,11 @@ def reaction(trace: np.ndarray) -> tuple[float, ...]:
     return (too_much > BONUS / 2).sum(), too_much.mean() / BONUS, lam[here].mean(), lam[~here].mean()
 
 
+def backup_trust(sigma_m: np.ndarray, temperature: float) -> np.ndarray:
+    """``agents.value.backup_weight``, on the host and of a sigma_m that is known."""
+    return 1.0 / (1.0 + np.exp(temperature * sigma_m)) + 0.5
+
+
 class Walked(NamedTuple):
     """Steps (B, ...) and what came of them."""
 
@@ -155,7 +160,7 @@ class _Judge:
         adjusted = np.asarray(mitigation.signal(evidence, self.usual[mitigation]).reward, float)
         opinions = self.opinions(steps.observation)
         if heat := getattr(agent, "backup_temperature", 0.0):
-            adjusted = adjusted * (1.0 / (1.0 + np.exp(heat * opinions.std(0, ddof=1))) + 0.5)
+            adjusted = adjusted * backup_trust(opinions.std(0, ddof=1), heat)
         elif getattr(agent, "diversity", 0.0):
             adjusted = adjusted - (opinions.mean(0) - opinions.min(0))
         caution, lam = reward, np.zeros(len(reward))

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from matplotlib.figure import Figure
 
 from uard import statistics
+from uard.lab.examine import WINDOWS
 from uard.lab.result import CALIBRATION, RATING_ERROR
 from uard.lab.study import Row
 from uard.reporting import distortion, figures, paper
@@ -150,12 +149,17 @@ def losses(p: Published) -> list[str]:
                     f"With {100 * r['rated']:g} % of steps rated, the learned model of the ratings does worse than a table of running "
                     f"means: {full(learned)} against {full(table)}. Here it extrapolates what few ratings do not support."
                 )
-    for r in (*p.rows("deep-rivals", mitigation="uard"), *p.rows("deep-feedback")):
+    settings = [
+        (r, f"{r['agent']}, {r['panel']} panel, very noisy raters") for r in p.rows("deep-rivals", mitigation="uard")
+    ]
+    settings += [
+        (r, f"ensemble-dqn, a {r['source']} of the ratings, {100 * r['rated']:g} % rated")
+        for r in p.rows("deep-feedback")
+    ]
+    for r, where in settings:
         goals = p.per_seed(r, "goal_rate")
         if lost := int((goals < 0.5).sum()):
-            where = ", ".join(f"{100 * v:g} % rated" if k == "rated" else str(v) for k, v in r.labels if v != "uard")
-            noisy = ", very noisy raters" if "panel" in dict(r.labels) else ""
-            out.append(f"uard lost the goal in {lost} of {len(goals)} runs with {where}{noisy}.")
+            out.append(f"uard lost the goal in {lost} of {len(goals)} runs: {where}.")
     games = p.rows("gaming", mitigation="uard")
     beaten = []
     for r in games:
@@ -325,7 +329,7 @@ def drawn(p: Published) -> list[tuple[str, str, str]]:
         )
         made.append(("G14, G15 · confidence-adjusted reward under distortion", note, _adjusted(p)))
         note = "Left: what each would learn from; right: lambda_t of uard, which rises where the reward contradicts the raters."
-        made.append(("G12 · a hacking region, and lambda_t", note, _region(p)))
+        made.append(("G12 · a hacking region, and lambda_t", note, figures.hacking_region(_trace(p, "uard"), WINDOWS)))
     return [(title, note, figures.data_uri(figure)) for title, note, figure in made]
 
 
@@ -353,35 +357,9 @@ def _trace(p: Published, agent: str) -> np.ndarray:
     return trace
 
 
-def _shade(axis: Any) -> None:
-    for a, b in distortion.WINDOWS:
-        axis.axvspan(a, b, color="#f2d7a0", alpha=0.6, lw=0)
-
-
 def _adjusted(p: Published) -> Figure:
-    figure, axes = figures._axes(2, 6.2, 3.8)
-    ours = _trace(p, "uard")[1]
-    for axis, rival in zip(axes, ("edac", "sunrise"), strict=True):
-        _shade(axis)
-        axis.plot(_trace(p, rival)[1], color=COLOURS[rival], lw=1, label=rival)
-        axis.plot(ours, color=figures.COLOURS["uard"], lw=1.2, label="ensemble-dqn + uard")
+    rivals = {name: (_trace(p, name)[1], COLOURS[name]) for name in ("edac", "sunrise")}
+    figure = figures.adjusted_reward(rivals, _trace(p, "uard")[1], "ensemble-dqn + uard", WINDOWS)
+    for axis in figure.axes:
         axis.axhline(distortion.THRESHOLD, color="k", ls=":", lw=1)
-        axis.set(xlabel="step", ylabel="confidence-adjusted reward", ylim=(-1.2, 2.2))
-        axis.legend(loc="lower right")
-    return figure
-
-
-def _region(p: Published) -> Figure:
-    figure, axes = figures._axes(2, 6.2, 3.8)
-    observed, adjusted, caution, lam = _trace(p, "uard")
-    for axis in axes:
-        _shade(axis)
-        axis.set(xlabel="step")
-    axes[0].plot(observed, color="#c1272d", lw=1, label="naive (observed)")
-    axes[0].plot(caution, color=figures.COLOURS["lcb"], lw=1, label="Caution (mean - sd)")
-    axes[0].plot(adjusted, color=figures.COLOURS["uard"], lw=1.2, label="uard")
-    axes[0].set(ylabel="effective reward", ylim=(-1.6, 2.2))
-    axes[0].legend(loc="lower right")
-    axes[1].plot(lam, color=figures.COLOURS["uard"], lw=1)
-    axes[1].set(ylabel="lambda_t", yscale="log")
     return figure

@@ -20,11 +20,9 @@ import numpy as np
 
 from uard.agents.value import DeepQ
 from uard.lab.cell import Cell
-from uard.lab.examine import STEPS, WINDOWS, inside
+from uard.lab.examine import STEPS, backup_trust, inside
 from uard.lab.result import TABLES, Result
 from uard.mitigation import Evidence, Feedback, RatedReward, RewardDiscounting
-
-__all__ = ["STEPS", "WINDOWS", "activations", "inside", "walk"]
 
 BONUS = 1.5
 THRESHOLD = 0.3
@@ -78,7 +76,7 @@ def walk(cell: Cell, result: Result, seed: int) -> Trace:
         lam = cell.mitigation.coefficient(cell.mitigation.disagreement(observed, known), usual)
         return Trace(observed, np.asarray(adjusted), np.asarray(caution), np.asarray(lam), counts)
     if isinstance(cell.agent, DeepQ):
-        weight = 1.0 / (1.0 + np.exp(cell.agent.temperature * at["sigma_m"])) + 0.5
+        weight = backup_trust(at["sigma_m"], cell.agent.temperature)
         return Trace(observed, weight * observed, observed, 0.0 * observed, counts)
     return Trace(observed, observed - (at["mu"] - at["lowest_value"]), observed, 0.0 * observed, counts)
 

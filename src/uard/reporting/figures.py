@@ -1,4 +1,4 @@
-"""The paper's figures (G2-G5, G8, G9, G11, G13, G16) from our runs, and ours. Every function returns a figure."""
+"""The paper's figures (G2-G5, G8, G9, G11-G16) from our runs, and ours. Every function returns a figure."""
 
 from __future__ import annotations
 
@@ -290,3 +290,48 @@ def walks(e: Evidence) -> Figure:
         end = "reaches the goal" if path[-1] == grid.states - 1 else f"never arrives in {len(path) - 1} steps"
         axis.set_title(f"{agent}: {end}")
     return figure
+
+
+def adjusted_reward(
+    rivals: dict[str, tuple[np.ndarray, str]], ours: np.ndarray, label: str, windows: Sequence[tuple[int, int]]
+) -> Figure:
+    """G14, G15: the confidence-adjusted reward of each rival (steps and colour) and ours, windows shaded."""
+    figure, axes = _axes(len(rivals), 6.2, 3.8)
+    for axis, (rival, (values, colour)) in zip(axes, rivals.items(), strict=True):
+        _shade(axis, windows)
+        axis.plot(values, color=colour, lw=1, label=rival)
+        axis.plot(ours, color=COLOURS["uard"], lw=1.2, label=label)
+        axis.set(ylabel="confidence-adjusted reward")
+        _legend_below(axis)
+    return figure
+
+
+def hacking_region(trace: np.ndarray, windows: Sequence[tuple[int, int]]) -> Figure:
+    """G12: what is learned from in a hacking region, and lambda_t.
+
+    The trace's first rows are the observed, the adjusted and Caution's reward, and lambda_t.
+    """
+    figure, axes = _axes(2, 6.2, 3.8)
+    observed, adjusted, caution, lam = trace[:4]
+    for axis in axes:
+        _shade(axis, windows)
+    axes[0].plot(observed, color=COLOURS["raw"], lw=1, label="naive (observed)")
+    axes[0].plot(caution, color=COLOURS["lcb"], lw=1, label="Caution (mean - sd)")
+    axes[0].plot(adjusted, color=COLOURS["uard"], lw=1.2, label="uard")
+    axes[0].set(ylabel="effective reward")
+    _legend_below(axes[0])
+    axes[1].plot(lam, color=COLOURS["uard"], lw=1)
+    axes[1].set(ylabel="lambda_t", yscale="log")
+    return figure
+
+
+def _shade(axis: Axes, windows: Sequence[tuple[int, int]]) -> None:
+    for a, b in windows:
+        axis.axvspan(a, b, color="#f2d7a0", alpha=0.6, lw=0)
+    axis.set(xlabel="step")
+
+
+def _legend_below(axis: Axes) -> None:
+    low, high = axis.get_ylim()
+    axis.set_ylim(bottom=low - 0.35 * (high - low))
+    axis.legend(loc="lower right")

@@ -633,10 +633,10 @@ def _on_hopper() -> str:
     """Say how many exploit activations the same study counts in MuJoCo, if it is published."""
     p = published.packaged()
     counts = [
-        f"{r['agent']} {brief_ci(statistics.summarise(p.derived(r, 'reaction')[:, 0]))}"
+        f"{r['agent']}, critics {r['critics']}: {brief_ci(statistics.summarise(p.derived(r, 'reaction')[:, 0]))}"
         for r in p.rows(locomotion.DISTORTION)
     ]
-    return f" On Hopper (mujoco-standard-distortion), of 60: {', '.join(counts)}." if counts else ""
+    return f" On Hopper (mujoco-standard-distortion), of 60: {'; '.join(counts)}." if counts else ""
 
 
 @_claim("J22")

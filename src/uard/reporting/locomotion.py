@@ -237,9 +237,14 @@ def drawn(p: Published) -> list[tuple[str, str, str]]:
     traced = p.rows(DISTORTION)
     if len(traced) == len(p.studies[DISTORTION].rows):
         note = "The first seed. Shaded: the windows in which the observed reward is inflated."
-        made.append(("G14, G15 · confidence-adjusted reward under distortion, Hopper", note, _adjusted(p)))
+        rivals = {name: (_traced(p, name)[1], "#c1272d") for name in ("edac", "sunrise")}
+        ours = _traced(p, "uard")
+        figure = figures.adjusted_reward(rivals, ours[1], "ensemble-sac + uard", examine.WINDOWS)
+        made.append(("G14, G15 · confidence-adjusted reward under distortion, Hopper", note, figure))
         note = "Left: what each would learn from; right: lambda_t of uard, which should rise in the windows."
-        made.append(("G12 · a hacking region, and lambda_t, Hopper", note, _windows(p)))
+        made.append(
+            ("G12 · a hacking region, and lambda_t, Hopper", note, figures.hacking_region(ours, examine.WINDOWS))
+        )
         note = (
             "The reward of a random action's step is raised by epsilon and then filtered. Left: the mean advantage of the "
             "agent's own action over it, on the learned critics; right: how often its sign is kept. Mean over seeds."
@@ -248,50 +253,9 @@ def drawn(p: Published) -> list[tuple[str, str, str]]:
     return [(title, note, figures.data_uri(figure)) for title, note, figure in made]
 
 
-def _shaded(axes: Any) -> None:
-    for axis in axes:
-        for a, b in examine.WINDOWS:
-            axis.axvspan(a, b, color="#f2d7a0", alpha=0.6, lw=0)
-        axis.set(xlabel="step")
-
-
 def _traced(p: Published, agent: str) -> np.ndarray:
     (r, *_) = p.rows(DISTORTION, agent=agent)
     return p.derived(r, "trace")
-
-
-def _legend_below(axis: Any) -> None:
-    low, high = axis.get_ylim()
-    axis.set_ylim(bottom=low - 0.35 * (high - low))
-    axis.legend(loc="lower right")
-
-
-def _adjusted(p: Published) -> Figure:
-    figure, axes = figures._axes(2, 6.2, 3.8)
-    _shaded(axes)
-    for axis, rival in zip(axes, ("edac", "sunrise"), strict=True):
-        axis.plot(_traced(p, rival)[1], color="#c1272d", lw=1, label=rival)
-        axis.plot(_traced(p, "uard")[1], color=COLOURS["uard"], lw=1.2, label="ensemble-sac + uard")
-        axis.set(ylabel="confidence-adjusted reward")
-        _legend_below(axis)
-    return figure
-
-
-def _windows(p: Published) -> Figure:
-    figure, axes = figures._axes(2, 6.2, 3.8)
-    _shaded(axes)
-    observed, adjusted, caution, lam, _ = _traced(p, "uard")
-    for values, colour, label in (
-        (observed, "#c1272d", "naive (observed)"),
-        (caution, figures.COLOURS["lcb"], "Caution (mean - sd)"),
-        (adjusted, COLOURS["uard"], "uard"),
-    ):
-        axes[0].plot(values, color=colour, lw=1, label=label)
-    axes[0].set(ylabel="effective reward")
-    _legend_below(axes[0])
-    axes[1].plot(lam, color=COLOURS["uard"], lw=1)
-    axes[1].set(ylabel="lambda_t", yscale="log")
-    return figure
 
 
 def _signs(p: Published) -> Figure:
