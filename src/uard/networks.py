@@ -112,12 +112,25 @@ def mlp(key: Array, sizes: tuple[int, ...], members: int | None = None, last_gai
 
 
 def through(layers: tuple[Layer, ...], x: Array) -> Array:
-    """Apply a stack, ReLU between: (B, inputs) to (B, outputs), or (N, B, outputs) for N stacks."""
+    """Apply a stack, ReLU between: (B, inputs) to (B, outputs), or (N, B, outputs) for N stacks.
+
+    Whole numbers (B,) stand for one-hot rows, whose product with a weight is a row of it.
+    """
     for i, (weight, bias) in enumerate(layers):
-        x = jnp.matmul(x, weight) + bias[..., None, :]
+        x = times(x, weight) + bias[..., None, :]
         if i + 1 < len(layers):
             x = jax.nn.relu(x)
     return x
+
+
+def times(x: Array, weight: Array) -> Array:
+    """Return x weight of rows (..., B, inputs), or of the whole numbers (..., B) that stand for one-hot rows.
+
+    Looked up instead of multiplied, a gradient of five networks on 100 states takes 160 us instead of 300.
+    """
+    if jnp.issubdtype(x.dtype, jnp.integer):
+        return weight.at[..., x, :].get(mode="promise_in_bounds")
+    return jnp.matmul(x, weight)
 
 
 def init(ensemble: Ensemble, network: Network, key: Array, features: int, outputs: int) -> Weights:
@@ -175,11 +188,20 @@ def _dropped(ensemble: Ensemble, layers: tuple[Layer, ...], x: Array, key: Array
     x = jnp.broadcast_to(x, (passes, *x.shape))
     keys = jax.random.split(key, len(layers))
     for i, (weight, bias) in enumerate(layers):
-        x = jnp.matmul(x, weight) + bias
+        x = times(x, weight) + bias
         if i + 1 < len(layers):
             kept = jax.random.uniform(keys[i], x.shape) >= ensemble.dropout
             x = jnp.where(kept, jax.nn.relu(x) / (1.0 - ensemble.dropout), 0.0)
     return x
+
+
+def chosen(values: Array, choice: Array) -> Array:
+    """Return the values (..., A) of the actions chosen, (...): what ``take_along_axis`` returns.
+
+    Summed over a mask, whose gradient is another; that of a gather is a scatter, element by element on a CPU.
+    """
+    here = jnp.arange(values.shape[-1]) == choice[..., None]
+    return jnp.where(here, values, 0.0).sum(-1)
 
 
 def mean_and_deviation(all_values: Array) -> tuple[Array, Array]:

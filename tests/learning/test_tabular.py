@@ -20,7 +20,7 @@ from uard.mitigation import NAMED, named
 from uard.training import fused, lanes
 from uard.training.fused import Lane, Outcome, Program
 from uard.training.lanes import LOG
-from uard.training.xla import TABULAR_OPTIONS
+from uard.training.xla import OPTIONS
 
 # One program length for all tests, so that what agrees in shapes and classes is compiled once.
 PROGRAM = Program(episodes=300)
@@ -169,7 +169,7 @@ def test_side_by_side_gives_the_same_log():
     stacked = jax.tree.map(
         lambda *leaves: np.stack([np.float32(x) if isinstance(x, float) else x for x in leaves]), *mixed()
     )
-    side_by_side = jax.jit(jax.vmap(lambda one: fused.run(one, PROGRAM)), compiler_options=TABULAR_OPTIONS)
+    side_by_side = jax.jit(jax.vmap(lambda one: fused.run(one, PROGRAM)), compiler_options=OPTIONS)
     outcome: Outcome = side_by_side(stacked)
     for i, alone in enumerate(train(*mixed())):
         np.testing.assert_array_equal(outcome.steps[i], alone["steps"])
@@ -207,7 +207,7 @@ def test_learning_never_sees_the_truth(name: str):
 
 def test_numbers_do_not_recompile():
     train(on_grid())
-    before = lanes.on_tables._cache_size()
+    before = lanes.one_by_one._cache_size()
     grid = TrapGrid(size=5, traps=((1, 1), (2, 3)), trap_reward=6.5, goal=(0, 4), horizon=33)
     for lane in (
         on_grid(lam=1.5, alpha=0.2, beta=0.9, kappa=3.0, unrated_weight=0.5, prior_count=0.0),
@@ -218,15 +218,15 @@ def test_numbers_do_not_recompile():
         on_grid(grid=paper_grid(10, 8.0, legitimate=True)),
     ):
         train(lane)
-    assert lanes.on_tables._cache_size() == before
+    assert lanes.one_by_one._cache_size() == before
 
 
 def test_whole_numbers_are_numbers_too():
     train(on_grid())
-    before = lanes.on_tables._cache_size()
+    before = lanes.one_by_one._cache_size()
     same(train(on_grid(lam=1, kappa=2))[0], train(on_grid(lam=1.0, kappa=2.0))[0])
     train(on_grid(agent=QLearning(epsilon=1, bootstrap=1, gamma=0)))
-    assert lanes.on_tables._cache_size() == before
+    assert lanes.one_by_one._cache_size() == before
     assert lanes.signature(on_grid(lam=1)) == lanes.signature(on_grid(lam=0.5)), "they fit into one batch"
 
 

@@ -22,7 +22,7 @@ def three():
 def test_the_program_of_a_gpu_gives_what_the_program_of_a_cpu_gives(three):
     stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(x, lanes.narrow(x)) for x in leaves]), *three)
     abreast = jax.tree.map(np.asarray, lanes.side_by_side(stacked, fused.run, PROGRAM, FIELDS))
-    for i, alone in enumerate(lanes.train(three, fused.run, PROGRAM, FIELDS, room=3, tables=True)):
+    for i, alone in enumerate(lanes.train(three, fused.run, PROGRAM, FIELDS, room=3)):
         np.testing.assert_array_equal(abreast["steps"][i], alone["steps"])
         np.testing.assert_allclose(abreast["log"][i], alone["log"], rtol=1e-5, atol=1e-4)
         np.testing.assert_allclose(abreast["q"][i], alone["q"], rtol=1e-4, atol=1e-4)
@@ -34,7 +34,7 @@ def test_a_gpu_gets_its_program(three, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     program = lanes.side_by_side
     monkeypatch.setattr(lanes, "side_by_side", lambda *given: asked.append(given[1:]) or program(*given))
-    assert len(lanes.train(three, fused.run, PROGRAM, FIELDS, room=3, tables=True)) == 3
+    assert len(lanes.train(three, fused.run, PROGRAM, FIELDS, room=3)) == 3
     assert asked == [(fused.run, PROGRAM, FIELDS)]
 
 

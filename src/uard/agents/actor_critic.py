@@ -147,10 +147,9 @@ class SoftActorCritic:
                 mask = jnp.ones((1, mask.shape[1]), mask.dtype)
             opinions = lax.stop_gradient(opinions)
             _, sigma = networks.mean_and_deviation(opinions)
-            here = batch.action[:, None]
-            reward, share = judge(jnp.take_along_axis(sigma, here, -1)[:, 0])
+            reward, share = judge(networks.chosen(sigma, batch.action))
             target = reward + jnp.where(batch.terminated, 0.0, self.gamma * value)
-            taken = jnp.take_along_axis(q, here[None], -1)[..., 0]
+            taken = networks.chosen(q, batch.action)
             error = (taken - lax.stop_gradient(target)) / scale
             critics = (mask * share * optax.losses.huber_loss(error)).mean()
             if q.shape[0] > 1:  # with diversity 0 this costs little, and diversity remains a number

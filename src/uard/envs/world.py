@@ -90,7 +90,7 @@ class World(Protocol):
         ...
 
     def observe(self, state: Any) -> Array:
-        """Return the observation, (features,) float32."""
+        """Return the observation: (features,) float32, or () int32 for the place of the one in a one-hot vector."""
         ...
 
     def slot(self, state: Any, action: Array) -> Array:
@@ -168,8 +168,8 @@ class TableWorld:
         return Step(task.next_state[place], task.reward[place], task.terminal[place], doubt)
 
     def observe(self, state: Array) -> Array:
-        """Return the state one-hot."""
-        return (jnp.arange(self.features) == state).astype(jnp.float32)
+        """Return the state: the place of the one in its one-hot vector."""
+        return jnp.asarray(state, jnp.int32)
 
     def slot(self, state: Array, action: Array) -> Array:
         """Return the number of the state-action; none share one."""

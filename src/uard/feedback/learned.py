@@ -156,12 +156,12 @@ def fit(spec: RatingModel, model: Model, known: Memory, observe: Any, actions: i
         states = jax.tree.map(lambda x: x[drawn], known.states)
         observations = jax.vmap(observe)(states)
         target = (heard[drawn] - location) / scale
-        action = known.actions[drawn]
+        here = jnp.arange(actions) == known.actions[drawn][:, None]
 
         def loss(layers: Any) -> Array:
             out = _predict(spec, layers, model.prior, observations, actions)
-            taken = jnp.take_along_axis(out, action[None, :, None, None], 2)[:, :, 0]
-            return optax.losses.huber_loss(taken, target[None]).sum(-1).mean(-1).sum()
+            each = optax.losses.huber_loss(out, target[None, :, None])
+            return jnp.where(here[:, :, None], each, 0.0).sum() / spec.batch
 
         gradient = jax.grad(loss)(layers)
         after = descend(spec.learning_rate, gradient, optimiser, layers)

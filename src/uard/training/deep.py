@@ -15,6 +15,7 @@ from uard.envs.world import Step, TableWorld, Verdict, World
 from uard.feedback import learned, running
 from uard.feedback.learned import RatingModel
 from uard.mitigation import Feedback, Mitigation
+from uard.networks import chosen
 from uard.training.tracing import traceable
 
 CHUNK = 128  # steps between fits of the rating model; what is usual is measured then
@@ -131,7 +132,7 @@ class FeedbackSource:
         if not self.tabulates:
             return ()
         assert self.spec is not None
-        observations = jnp.eye(self.world.features, dtype=jnp.float32)
+        observations = jax.vmap(self.world.observe)(jnp.arange(self.world.features))
         return learned.read(self.spec, model, observations, self.world.actions, self.world.raters)
 
     def record(self, known: learned.Memory, state: Any, action: Array, after: Step, key: Array) -> learned.Memory:
@@ -173,8 +174,7 @@ class FeedbackSource:
         if self.spec is None:
             return running.read(known.rows[jax.vmap(self.world.slot)(states, actions)], self.world.raters)
         every = self.of_all(known, model, states)
-        pick = [jnp.take_along_axis(x, actions[:, None], 1)[:, 0] for x in every[:5]]
-        return Feedback._make([*pick, every.raters])
+        return Feedback._make([*(chosen(x, actions) for x in every[:5]), every.raters])
 
     def of_all(self, known: learned.Memory, model: Any, states: Any) -> Feedback:
         """Return the feedback of all actions in states, (B, A) arrays."""

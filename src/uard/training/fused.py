@@ -99,7 +99,7 @@ def train(
     these: list[Lane], program: Program, fields: tuple[str, ...] = ("log", "steps")
 ) -> list[dict[str, np.ndarray]]:
     """Train all lanes, which must agree in everything that is not a number, and return the asked-for fields."""
-    return lanes.train(these, run, program, fields, ROOM, tables=True)
+    return lanes.train(these, run, program, fields, ROOM)
 
 
 class _Carry(NamedTuple):

@@ -16,15 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from uard.training.xla import TABULAR_OPTIONS
+from uard.training.xla import OPTIONS
 
 LOG = ("trap_visits", "true_return", "observed_return", "goal", "length", "abstained")  # per-episode sums
 Run = Callable[[Any, Any], Any]  # (lane, program) -> a NamedTuple of arrays
 
 
-def train(
-    lanes: list[Any], run: Run, program: Any, fields: tuple[str, ...], room: int, tables: bool = False
-) -> list[dict[str, Any]]:
+def train(lanes: list[Any], run: Run, program: Any, fields: tuple[str, ...], room: int) -> list[dict[str, Any]]:
     """Run all lanes, which must agree in everything that is not a number, and return the asked-for fields of each.
 
     Args:
@@ -33,14 +31,13 @@ def train(
         program: Second argument of ``run``; hashable.
         fields: Which fields of what ``run`` returns.
         room: The program has room for a multiple of this many lanes: fewer are no reason to compile again.
-        tables: Compile for tables rather than for networks.
     """
     filled = lanes + [lanes[-1]] * (-(-len(lanes) // room) * room - len(lanes))
     stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(x, narrow(x)) for x in leaves]), *filled)
     if jax.default_backend() != "cpu":
         out = side_by_side(stacked, run, program, fields)
     else:
-        out = (on_tables if tables else on_networks)(stacked, np.int32(len(lanes)), run, program, fields)
+        out = one_by_one(stacked, np.int32(len(lanes)), run, program, fields)
     host = jax.tree.map(np.asarray, out)
     return [jax.tree.map(lambda value, i=i: value[i], host) for i in range(len(lanes))]
 
@@ -78,6 +75,5 @@ def _abreast(lanes: Any, run: Run, program: Any, fields: tuple[str, ...]) -> dic
 
 
 _FIXED = ("run", "program", "fields")
-on_tables = jax.jit(_each, static_argnames=_FIXED, compiler_options=TABULAR_OPTIONS)
-on_networks = jax.jit(_each, static_argnames=_FIXED)
+one_by_one = jax.jit(_each, static_argnames=_FIXED, compiler_options=OPTIONS)
 side_by_side = jax.jit(_abreast, static_argnames=_FIXED)
