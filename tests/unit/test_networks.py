@@ -171,3 +171,39 @@ def test_size_counts_numbers():
 def test_what_is_refused(make: Any, field: str):
     with pytest.raises(InvalidValueError, match=f"^{field} = "):
         make()
+
+
+@pytest.mark.parametrize("ensemble", ENSEMBLES, ids=lambda e: f"{e.kind}-{e.members}")
+def test_a_number_stands_for_its_one_hot_row(ensemble: Ensemble):
+    """Values and gradients of places (B,) are those of one-hot rows; a place drawn twice counts twice."""
+    weights, places = drawn(ensemble), jnp.array([3, 0, 3, 5])
+    rows = jnp.asarray(np.eye(FEATURES, dtype=np.float32)[places])
+    np.testing.assert_array_equal(values(ensemble, weights, places), values(ensemble, weights, rows))
+
+    def slope(x: jax.Array) -> Any:
+        def cost(layers: Any) -> jax.Array:
+            return (networks.values(ensemble, NETWORK, Weights(layers, weights.prior), x, KEY) ** 2).sum()
+
+        return jax.grad(cost)(weights.layers)
+
+    of_places, of_rows = (jax.tree.leaves(slope(x)) for x in (places, rows))
+    for one, other in zip(of_places, of_rows, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
+    first = np.asarray(of_places[0])
+    assert np.any(first[..., 3, :] != 0)
+    np.testing.assert_array_equal(first[..., [1, 2, 4], :], 0)
+
+
+def test_the_chosen_are_those_at_their_places():
+    all_values = jax.random.normal(KEY, (2, BATCH, ACTIONS)).at[0, 0, 0].set(jnp.nan)
+    choice = jnp.array([1, 2, 0, 1])
+    slots = jnp.broadcast_to(choice[None, :, None], (2, BATCH, 1))
+
+    def gathered(v: jax.Array) -> jax.Array:
+        return jnp.take_along_axis(v, slots, -1)[..., 0]
+
+    np.testing.assert_array_equal(networks.chosen(all_values, choice), gathered(all_values))
+    one, other = (
+        jax.grad(lambda v, f=f: (f(v) ** 3).sum())(all_values) for f in (lambda v: networks.chosen(v, choice), gathered)
+    )
+    np.testing.assert_array_equal(one, other)
