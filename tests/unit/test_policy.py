@@ -351,8 +351,8 @@ class Spy(PPO):
     def init(self, key, features, actions):
         pair = (self.rollout, self.envs)
         told = {
-            "observation": jnp.zeros((*pair, features)),
-            "following": jnp.zeros((*pair, features)),
+            "observation": jnp.zeros(pair, jnp.int32),
+            "following": jnp.zeros(pair, jnp.int32),
             "reward": jnp.zeros(pair),
             "weight": jnp.zeros(pair),
             "cost": jnp.zeros(pair),
@@ -369,7 +369,7 @@ class Spy(PPO):
         return jnp.zeros((1, observations.shape[0]))
 
     def act(self, state, observations, key):
-        return (jnp.argmax(observations, -1) >= jnp.arange(self.envs)).astype(jnp.int32)
+        return (observations >= jnp.arange(self.envs)).astype(jnp.int32)
 
     def update(self, state, experience, key):
         told = {name: getattr(experience, name) for name in state.costs if name != "scored"}
@@ -434,7 +434,7 @@ def test_steps_end_the_run_and_leave_empty_rows():
 def test_a_cut_shows_the_state_after_it_and_does_not_terminate():
     out = run(Spy(**{**SPY, "envs": 5}), corridor(3), deep.Program(episodes=1000, steps=20))
     told = jax.tree.map(np.asarray, out.good.costs)
-    walked = told["observation"].argmax(-1), told["following"].argmax(-1)
+    walked = told["observation"], told["following"]
     # The last copy never ends its episode: it is cut after its third step, in cell 3, and starts again in 0.
     np.testing.assert_array_equal(walked[0][:, 4], [0, 1, 2, 0])
     np.testing.assert_array_equal(walked[1][:, 4], [1, 2, 3, 1])
@@ -446,7 +446,7 @@ def test_a_cut_shows_the_state_after_it_and_does_not_terminate():
 def test_the_count_bonus_is_added_after_the_mitigation():
     plain, curious = (run(Spy(**SPY, count_bonus=b), corridor(50), deep.Program(100, 20)) for b in (0.0, 0.5))
     told = jax.tree.map(np.asarray, (plain.good.costs, curious.good.costs))
-    cells = told[0]["observation"].argmax(-1)
+    cells = told[0]["observation"]
     ends = told[0]["terminated"]
     np.testing.assert_allclose(told[0]["reward"], np.where(ends, cells, 0.1 * cells - 1), atol=1e-6)
     # Of 8 times: copy 0 ended in cell 0 each time, copy 1 every second time in 1, copy 2 twice in cell 2.
@@ -458,7 +458,7 @@ def test_the_count_bonus_is_added_after_the_mitigation():
 def test_only_an_oracle_is_told_of_hacks():
     blind, seeing = (run(make(**SPY), corridor(50), deep.Program(100, 20)).good.costs for make in (Spy, Oracle))
     assert (np.asarray(blind["cost"]) == 0).all()
-    hacks = np.asarray(seeing["terminated"]) & (np.asarray(seeing["observation"]).argmax(-1) == 1)
+    hacks = np.asarray(seeing["terminated"]) & (np.asarray(seeing["observation"]) == 1)
     assert hacks.any()
     np.testing.assert_array_equal(seeing["cost"], hacks)
     assert CPO().needs_cost
@@ -473,7 +473,7 @@ def test_the_mitigation_judges_the_whole_rollout(name):
     told = jax.tree.map(np.asarray, out.good.costs)
     mitigation = named(name)
     world = corridor(50)
-    cells, ends = told["observation"].argmax(-1), told["terminated"].astype(int)
+    cells, ends = told["observation"], told["terminated"].astype(int)
     feedback = jax.tree.map(np.asarray, out.feedback)
     here = jax.tree.map(lambda x: x[cells, ends], feedback)
     usual = mitigation.usual(jax.tree.map(np.ravel, feedback), np.ravel(feedback.count > 0))
