@@ -76,7 +76,7 @@ def bind(job: Job) -> Loop:
             if done + t < agent.warmup:
                 action = random.uniform(-1.0, 1.0, (1, spec.actions))
             else:
-                action = np.asarray(_act(live.agent, observation.astype(np.float32), keys[t], agent=agent))
+                action = np.asarray(_act(live.agent, observation.astype(np.float32), keys, t, agent=agent))
             moved = physics.step(action)
             book.write(moved)
             here.append(observation)
@@ -135,8 +135,8 @@ def _known(reservoir: Any, width: int) -> tuple[Any, Any]:
 
 
 @partial(jax.jit, static_argnames="agent")
-def _act(state: Any, observation: Array, key: Array, *, agent: ContinuousActorCritic) -> Array:
-    return agent.act(state, observation, key)
+def _act(state: Any, observation: Array, keys: Array, t: int, *, agent: ContinuousActorCritic) -> Array:
+    return agent.act(state, observation, keys[t])
 
 
 @partial(jax.jit, static_argnames="agent")

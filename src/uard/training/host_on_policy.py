@@ -48,7 +48,7 @@ def bind(job: Job) -> Loop:
         book = Book(live.sums, int(live.steps))
         here, actions, steps = [physics.observe()], [], []
         for t in range(length):
-            action = np.asarray(_act(live.agent, live.norm.of(here[-1]), keys[t]))
+            action = np.asarray(_act(live.agent.policy, live.norm.of(here[-1]), keys, t))
             moved = physics.step(np.clip(action, -1.0, 1.0))
             book.write(moved)
             steps.append(moved)
@@ -105,8 +105,8 @@ def bind(job: Job) -> Loop:
 
 
 @jax.jit
-def _act(state: Any, observations: Array, key: Array) -> Array:
-    return heads.draw(heads.say(state.policy, observations), key)
+def _act(policy: Any, observations: Array, keys: Array, t: int) -> Array:
+    return heads.draw(heads.say(policy, observations), keys[t])  # out here, taking a key costs more than the policy
 
 
 @jax.jit
