@@ -18,6 +18,7 @@ from uard.reporting.tables import Table, full
 
 HACKING, NOISE, KICK = "mujoco-standard-hacking", "mujoco-standard-noise", "mujoco-standard-kick"
 DISTORTION, RATING = "mujoco-standard-distortion", "mujoco-standard-rating"
+BONUSES, ABLATION = "mujoco-standard-bonuses", "mujoco-standard-ablation"
 AS_GOOD = 0.03  # by how much the AUROC of a cheaper sigma_m may be lower
 REMOVED, KEPT, COST = 0.936, 0.9, 0.05  # the paper's best reduction (J16); what is asked of a filter beside it
 METRICS = ("trap_visits", "true_return", "observed_return")
@@ -26,7 +27,9 @@ COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", 
 
 def tables(p: Published) -> list[Table]:
     """Return all tables for which there are results."""
-    return [t for t in (_hacking(p), _noise(p), _kick(p), _rating(p), _distortion(p)) if t.rows]
+    return [
+        t for t in (_hacking(p), _noise(p), _kick(p), _bonuses(p), _ablation(p), _rating(p), _distortion(p)) if t.rows
+    ]
 
 
 def _steps(p: Published, study: str) -> str:
@@ -112,6 +115,32 @@ def _kick(p: Published) -> Table:
         2,
         "An episode that ends before step 500 was never kicked.",
     )  # fmt: skip
+
+
+def _bonuses(p: Published) -> Table:
+    rows = [
+        (r["region"], f"{r['bonus']:g}", r["mitigation"], r["panel"], *(full(p.of(r, m)) for m in METRICS))
+        for r in p.rows(BONUSES)
+    ]
+    return Table(
+        f"How large a bonus breaks which mitigation: Hopper, PPO, {_steps(p, BONUSES)}",
+        (
+            "region", "bonus", "learns from", "panel", "steps in the region per episode", "true return",
+            "observed return",
+        ),
+        tuple(rows),
+        4,
+    )  # fmt: skip
+
+
+def _ablation(p: Published) -> Table:
+    rows = [(r["region"], r["variant"], r["panel"], *(full(p.of(r, m)) for m in METRICS)) for r in p.rows(ABLATION)]
+    return Table(
+        f"Which source does the work (H8): Hopper, PPO with uard, {_steps(p, ABLATION)}",
+        ("region", "doubt", "panel", "steps in the region per episode", "true return", "observed return"),
+        tuple(rows),
+        3,
+    )
 
 
 def _rating(p: Published) -> Table:
