@@ -126,7 +126,7 @@ def through(layers: tuple[Layer, ...], x: Array) -> Array:
 def times(x: Array, weight: Array) -> Array:
     """Return x weight of rows (..., B, inputs), or of the whole numbers (..., B) that stand for one-hot rows.
 
-    Looked up instead of multiplied, a gradient of five networks on 100 states takes 160 us instead of 300.
+    The look-up spares the gradient's products with zeros, about half of what a small network on a grid costs.
     """
     if jnp.issubdtype(x.dtype, jnp.integer):
         return weight.at[..., x, :].get(mode="promise_in_bounds")
@@ -195,7 +195,7 @@ def _dropped(ensemble: Ensemble, layers: tuple[Layer, ...], x: Array, key: Array
     return x
 
 
-def chosen(values: Array, choice: Array) -> Array:
+def batched_index(values: Array, choice: Array) -> Array:
     """Return the values (..., A) of the actions chosen, (...): what ``take_along_axis`` returns.
 
     Summed over a mask, whose gradient is another; that of a gather is a scatter, element by element on a CPU.

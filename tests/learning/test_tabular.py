@@ -20,7 +20,7 @@ from uard.mitigation import NAMED, named
 from uard.training import fused, lanes
 from uard.training.fused import Lane, Outcome, Program
 from uard.training.lanes import LOG
-from uard.training.xla import OPTIONS
+from uard.training.xla import COMPILER_OPTIONS
 
 # One program length for all tests, so that what agrees in shapes and classes is compiled once.
 PROGRAM = Program(episodes=300)
@@ -169,7 +169,7 @@ def test_side_by_side_gives_the_same_log():
     stacked = jax.tree.map(
         lambda *leaves: np.stack([np.float32(x) if isinstance(x, float) else x for x in leaves]), *mixed()
     )
-    side_by_side = jax.jit(jax.vmap(lambda one: fused.run(one, PROGRAM)), compiler_options=OPTIONS)
+    side_by_side = jax.jit(jax.vmap(lambda one: fused.run(one, PROGRAM)), compiler_options=COMPILER_OPTIONS)
     outcome: Outcome = side_by_side(stacked)
     for i, alone in enumerate(train(*mixed())):
         np.testing.assert_array_equal(outcome.steps[i], alone["steps"])

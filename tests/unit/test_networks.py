@@ -202,8 +202,7 @@ def test_the_chosen_are_those_at_their_places():
     def gathered(v: jax.Array) -> jax.Array:
         return jnp.take_along_axis(v, slots, -1)[..., 0]
 
-    np.testing.assert_array_equal(networks.chosen(all_values, choice), gathered(all_values))
-    one, other = (
-        jax.grad(lambda v, f=f: (f(v) ** 3).sum())(all_values) for f in (lambda v: networks.chosen(v, choice), gathered)
-    )
+    np.testing.assert_array_equal(networks.batched_index(all_values, choice), gathered(all_values))
+    ways = (lambda v: networks.batched_index(v, choice), gathered)
+    one, other = (jax.grad(lambda v, f=f: (f(v) ** 3).sum())(all_values) for f in ways)
     np.testing.assert_array_equal(one, other)

@@ -147,9 +147,9 @@ class SoftActorCritic:
                 mask = jnp.ones((1, mask.shape[1]), mask.dtype)
             opinions = lax.stop_gradient(opinions)
             _, sigma = networks.mean_and_deviation(opinions)
-            reward, share = judge(networks.chosen(sigma, batch.action))
+            reward, share = judge(networks.batched_index(sigma, batch.action))
             target = reward + jnp.where(batch.terminated, 0.0, self.gamma * value)
-            taken = networks.chosen(q, batch.action)
+            taken = networks.batched_index(q, batch.action)
             error = (taken - lax.stop_gradient(target)) / scale
             critics = (mask * share * optax.losses.huber_loss(error)).mean()
             if q.shape[0] > 1:  # with diversity 0 this costs little, and diversity remains a number

@@ -68,7 +68,7 @@ def log_probability(said: Said, action: Array) -> Array:
     if isinstance(said, Normal):
         z = (action - said.mean) * jnp.exp(-said.log_deviation)
         return -(0.5 * z * z + said.log_deviation + HALF_LOG_TAU).sum(-1)
-    return networks.chosen(jax.nn.log_softmax(said), action)
+    return networks.batched_index(jax.nn.log_softmax(said), action)
 
 
 def entropy(said: Said) -> Array:

@@ -16,9 +16,9 @@ class Batch(NamedTuple):
     """Transitions drawn from the buffer.
 
     Attributes:
-        observation: (B, features).
+        observation: (B, features), or (B,) whole numbers that stand for one-hot rows.
         action: (B,).
-        following: (B, features), the observation after the step.
+        following: Alike, the observation after the step.
         terminated: (B,), whether the step ended the episode; a cut-off at the horizon does not count.
         mask: (B, N), which members learn from a transition (0 or 1).
     """

@@ -33,9 +33,9 @@ class Experience(NamedTuple):
     """What one rollout of T steps in E copies of the world gave.
 
     Attributes:
-        observation: (T, E, features).
+        observation: (T, E, features), or (T, E) whole numbers that stand for one-hot rows.
         action: (T, E).
-        following: (T, E, features), the observation after the step, before any reset.
+        following: Alike, the observation after the step, before any reset.
         reward: (T, E), the reward to learn from.
         weight: (T, E), how much a step counts in the losses; 0 skips it.
         cost: (T, E), what CPO has to keep within its budget.
@@ -66,7 +66,7 @@ class Batch(NamedTuple):
     """A rollout made ready for learning: B = T E steps.
 
     Attributes:
-        observation: (B, features).
+        observation: (B, features), or (B,).
         action: (B,).
         advantage: (B,), of mean 0 and deviation 1 under ``weight``.
         target: (N, B), the members' lambda-returns.

@@ -125,7 +125,7 @@ class DeepQ:
         following = networks.values(self.ensemble, self.network, frozen, batch.following, drop_next)
         if backup == "consistent":
             mu, sigma = networks.mean_and_deviation(following)
-            value = networks.chosen(following, jnp.argmax(prefer(mu, sigma, batch.following), axis=-1))
+            value = networks.batched_index(following, jnp.argmax(prefer(mu, sigma, batch.following), axis=-1))
         else:
             value = following.max(-1)
         weight = jnp.where(batch.terminated, 1.0, backup_weight(value, self.temperature))
@@ -134,10 +134,10 @@ class DeepQ:
             weights = Weights(layers, state.weights.prior)
             passes = 1 if self.ensemble.kind == "dropout" else 0
             q = networks.values(self.ensemble, self.network, weights, batch.observation, drop, passes)
-            taken = networks.chosen(q, batch.action)
+            taken = networks.batched_index(q, batch.action)
             if self.ensemble.kind == "dropout" and self.members > 1:
                 opinions = networks.values(self.ensemble, self.network, weights, batch.observation, drop_read)
-                opinions = networks.chosen(opinions, batch.action)
+                opinions = networks.batched_index(opinions, batch.action)
                 targets, mask = value.mean(0, keepdims=True), jnp.ones_like(taken)
             else:
                 opinions, targets, mask = taken, value, batch.mask.T
@@ -174,7 +174,7 @@ def conservative_gap(values: Array, action: Array) -> Array:
         values: (N, B, A).
         action: (B,).
     """
-    return jax.nn.logsumexp(values, axis=-1) - networks.chosen(values, action)
+    return jax.nn.logsumexp(values, axis=-1) - networks.batched_index(values, action)
 
 
 def backup_weight(following: Array, temperature: Array | float) -> Array:

@@ -109,7 +109,7 @@ class World(Protocol):
 @jax.tree_util.register_pytree_node_class
 @dataclass(frozen=True)
 class TableWorld:
-    """A small problem given as tables; the state is a number and its observation one-hot.
+    """A small problem given as tables; the state is a number, observed as it is: it stands for the one-hot row.
 
     Attributes:
         task: What an agent meets; ``start`` may hold several states, of which each episode draws one.

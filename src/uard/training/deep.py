@@ -15,7 +15,7 @@ from uard.envs.world import Step, TableWorld, Verdict, World
 from uard.feedback import learned, running
 from uard.feedback.learned import RatingModel
 from uard.mitigation import Feedback, Mitigation
-from uard.networks import chosen
+from uard.networks import batched_index
 from uard.training.tracing import traceable
 
 CHUNK = 128  # steps between fits of the rating model; what is usual is measured then
@@ -174,7 +174,7 @@ class FeedbackSource:
         if self.spec is None:
             return running.read(known.rows[jax.vmap(self.world.slot)(states, actions)], self.world.raters)
         every = self.of_all(known, model, states)
-        return Feedback._make([*(chosen(x, actions) for x in every[:5]), every.raters])
+        return Feedback._make([*(batched_index(x, actions) for x in every[:5]), every.raters])
 
     def of_all(self, known: learned.Memory, model: Any, states: Any) -> Feedback:
         """Return the feedback of all actions in states, (B, A) arrays."""

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from uard.training.xla import OPTIONS
+from uard.training.xla import COMPILER_OPTIONS
 
 LOG = ("trap_visits", "true_return", "observed_return", "goal", "length", "abstained")  # per-episode sums
 Run = Callable[[Any, Any], Any]  # (lane, program) -> a NamedTuple of arrays
@@ -75,5 +75,5 @@ def _abreast(lanes: Any, run: Run, program: Any, fields: tuple[str, ...]) -> dic
 
 
 _FIXED = ("run", "program", "fields")
-one_by_one = jax.jit(_each, static_argnames=_FIXED, compiler_options=OPTIONS)
+one_by_one = jax.jit(_each, static_argnames=_FIXED, compiler_options=COMPILER_OPTIONS)
 side_by_side = jax.jit(_abreast, static_argnames=_FIXED)

@@ -85,7 +85,7 @@ def run(one: Lane, program: Program) -> Outcome:
 
         mask = (jax.random.uniform(mask_key, (agent.members,)) < agent.bootstrap).astype(jnp.float32)
         row = _Row(c.state, action, after.reward, after.doubt, after.state, after.terminated, mask)
-        buffer = _put(c.buffer, row, c.steps)
+        buffer = _put(c.buffer, row, c.steps % agent.buffer)
         learner, watched = c.agent, Watched(jnp.float32(0.0), jnp.float32(0.0))
         if learns:
             learner, watched = learn(c._replace(known=known), buffer, draw_key, learn_key)
@@ -171,15 +171,14 @@ def run(one: Lane, program: Program) -> Outcome:
     return deep.outcome(one, program, source, c, watch, greedy, read)
 
 
-def _put(buffer: Any, row: _Row, steps: Array) -> Any:
-    """Return the buffer with one more transition, over the oldest if it is full.
+def _put(buffer: Any, row: _Row, place: Array) -> Any:
+    """Return the buffer with a transition at a place.
 
     In a loop of its own, once round, of which the compiler does not know that it is once: it would otherwise read the
-    batch from the old buffer beside the write, and for that copy the buffer at every step, 40 % of a DQN's time.
+    batch from the old buffer beside the write, and for that copy the buffer at every step, a third of a DQN's time.
     """
 
     def write(_: Array, kept: Any) -> Any:
-        place = steps % jax.tree.leaves(kept)[0].shape[0]
         return jax.tree.map(lambda rows, new: rows.at[place].set(new), kept, row)
 
-    return lax.fori_loop(0, jnp.minimum(steps + 1, 1), write, buffer)
+    return lax.fori_loop(0, jnp.minimum(place + 1, 1), write, buffer)

@@ -17,7 +17,7 @@ _FLAG = "xla_backend_extra_options"
 _BOUND = "xla_cpu_small_while_loop_byte_threshold=10000000"
 
 # Level 1 compiles in two thirds of the default's time and, for these loops, to no slower code.
-OPTIONS = {"xla_backend_optimization_level": 1}
+COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
 
 
 def keep_programs() -> None:
