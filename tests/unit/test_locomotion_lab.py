@@ -17,13 +17,14 @@ from uard.envs.trapgrid import TrapGrid
 from uard.feedback.learned import RatingModel
 from uard.feedback.transitions import TransitionModel
 from uard.lab import names, runner
-from uard.lab.cell import Cell
+from uard.lab.cell import RESULTS, Cell
+from uard.lab.result import METRICS
 from uard.lab.store import Store
 from uard.mitigation import Raw, named
 from uard.networks import Ensemble, Network
 from uard.reporting import locomotion as shown
-from uard.reporting.published import packaged_json
-from uard.studies import locomotion
+from uard.reporting.published import Published, packaged_json
+from uard.studies import every, locomotion
 
 TINY = PPO(Network(16, 1e-3, 100.0), Ensemble("shared", 3), envs=4, rollout=32, epochs=1, count_bonus=0.0)
 WHERE = Locomotion("hopper", region=Vibration(shaking=0.5, speed=5.0))
@@ -110,6 +111,22 @@ def test_studies_of_all_sizes_are_the_same_questions():
     assert {r.cell.steps for s in sizes[2] for r in s.rows} == {1_000_000}
     agents = {r["agent"] for s in sizes[1] for r in s.rows if s.name.endswith("hacking")}
     assert agents == set(names.CONTINUOUS) - {"cpo-oracle"}
+
+
+def test_every_study_is_shown_by_a_table_with_a_line_for_each_row():
+    studies = [s for s in locomotion.studies(locomotion.STANDARD) if s.name != shown.DISTORTION]
+    seeds = {
+        "seeds": [0, 1],
+        "metrics": {m: [1.0, 2.0] for m in METRICS},
+        "derived": {"deterministic": [[1, 2], [3, 4]]},
+    }
+    cells = {r.cell.key: seeds for s in studies for r in s.rows}
+    tables = shown.tables(Published(every(), [{"results": RESULTS, "cells": cells}]))
+    assert sorted(len(t.rows) for t in tables) == sorted(len(s.rows) for s in studies)
+    for table in tables:
+        assert {len(r) for r in table.rows} == {len(table.columns)}
+        assert len({r[: table.labels] for r in table.rows}) == len(table.rows), "labels tell rows apart"
+        assert "2 seeds" in table.title
 
 
 def test_the_film_has_a_strip_for_each_policy_and_says_what_it_is():

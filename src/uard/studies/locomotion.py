@@ -17,6 +17,7 @@ from uard.studies.paper import PANELS, RAW
 
 REGIONS = {"vibration": Vibration, "posture": Posture}
 RATED = 0.15
+EARLY = 100  # few agents of the smaller sizes still stand at step 500
 NOISE_UNIT = 4.0  # the paper's noise is in per cent, of what it does not say: of the bonus, here
 
 
@@ -116,16 +117,20 @@ def noise(scale: Scale) -> tuple[Row, ...]:
 
 
 def kick(scale: Scale) -> tuple[Row, ...]:
-    """A state thrown off by +5 at step 500 (G10): one coordinate, and all."""
+    """A state thrown off by +5 (G10): one coordinate, and all; at the paper's step 500, and early for beginners."""
     agent, steps = scale.agents["ppo"]
+    kicks: list[tuple[str, int, Kick | None]] = [("never", 0, None)]
+    for step in (500, EARLY):
+        kicks += [("forward velocity", step, Kick(step)), ("all", step, Kick(step, coordinate=None))]
     return tuple(
         row(
-            _cell(Locomotion(kick=Kick(coordinate=coordinate)), named(mitigation), agent, steps),
+            _cell(Locomotion(kick=kick), named(mitigation), agent, steps),
             mitigation=mitigation,
-            kicked="forward velocity" if coordinate is not None else "all",
+            kicked=kicked,
+            at=step,
         )
         for mitigation in ("raw", "uard")
-        for coordinate in (5, None)
+        for kicked, step, kick in kicks
     )
 
 
@@ -190,7 +195,7 @@ def studies(scale: Scale) -> tuple[Study, ...]:
         Study(f"{of}-hacking", f"Hacking in MuJoCo, {scale.name}", "H4, G6, G7, J16, J36", hacking(scale)),
         Study(f"{of}-bonuses", f"Bonuses of 4, 6 and 8, {scale.name}", "DESIGN: what breaks which", bonuses(scale)),
         Study(f"{of}-noise", f"Violations against noise, {scale.name}", "H11, G11, J25", noise(scale)),
-        Study(f"{of}-kick", f"A kick at step 500, {scale.name}", "H12, G10", kick(scale)),
+        Study(f"{of}-kick", f"A kick, {scale.name}", "H12, G10", kick(scale)),
         Study(f"{of}-ablation", f"Which source does the work in MuJoCo, {scale.name}", "H8", ablation(scale)),
         Study(f"{of}-rating", f"Which steps are rated, {scale.name}", "DESIGN: active rating", rating(scale)),
         Study(
