@@ -104,7 +104,14 @@ def _std(values: Array, axis: int, ddof: int) -> Array:
     xp = namespace(values)
     centre = xp.mean(values, axis=axis, keepdims=True)
     square = (values - centre) * (values - centre)
-    return xp.sqrt(xp.sum(square, axis=axis) / (values.shape[axis] - ddof))
+    return _root(xp.sum(square, axis=axis) / (values.shape[axis] - ddof))
+
+
+def _root(variance: Array) -> Array:
+    """Return the square root; its gradient where all agree is 0, not infinite: an actor may climb a score of it."""
+    xp = namespace(variance)
+    apart = xp.where(variance == 0, xp.ones_like(variance), xp.zeros_like(variance))
+    return xp.sqrt(variance + apart) - apart
 
 
 def _masked_std(ratings: Array, mask: Array, axis: int, ddof: int, empty: float | None) -> Array:
@@ -122,7 +129,7 @@ def _masked_std(ratings: Array, mask: Array, axis: int, ddof: int, empty: float 
     centre = xp.sum(values, axis=axis, keepdims=True) / xp.where(count > 0, count, one)
     square = xp.where(mask, (values - centre) * (values - centre), xp.zeros_like(values))
     variance = xp.sum(square, axis=axis, keepdims=True) / xp.where(few, one, count - ddof)
-    sigma = xp.where(few, one * (math.nan if empty is None else empty), xp.sqrt(variance))
+    sigma = xp.where(few, one * (math.nan if empty is None else empty), _root(variance))
     return xp.squeeze(sigma, axis=axis)
 
 

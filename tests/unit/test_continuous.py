@@ -88,6 +88,16 @@ def test_the_actor_climbs_the_critics_to_the_best_action():
     assert float(agent.greedy(state, nothing[:1])[0, 0]) == pytest.approx(0.5, abs=0.1)
 
 
+def test_an_actor_that_climbs_a_score_of_sigma_survives_critics_that_agree_to_the_bit():
+    agent = sac(**SMALL)
+    state = agent.init(jax.random.key(0), 3, 2)
+    alike = jax.tree.map(lambda x: jnp.stack([x[0], x[0]]), state.trained.critics)
+    state = state._replace(trained=state.trained._replace(critics=alike), target=alike)
+    new, watched = agent.update(state, batch_of(), plain(jnp.ones(32)), lambda mu, s: mu - s, jax.random.key(0))
+    assert np.isfinite(watched.loss)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(new.trained))
+
+
 def test_an_end_has_no_future_and_a_step_of_weight_zero_teaches_nothing():
     agent = sac(**SMALL)
     batch = batch_of()

@@ -108,6 +108,15 @@ def test_whole_numbers_are_ratings_too(library):
     assert np.asarray(sigma_model(stars)) == pytest.approx([2.0, 0.0])
 
 
+def test_where_all_agree_the_gradient_is_zero_and_not_nan():
+    values = np.array([[1.0, 1.0], [1.0, 3.0]], np.float32)
+    expected = [[0.0, 0.0], [-math.sqrt(0.5), math.sqrt(0.5)]]
+    np.testing.assert_allclose(jax.grad(lambda x: sigma_model(x).sum())(jnp.asarray(values)), expected, rtol=1e-6)
+    leaf = torch.tensor(values, requires_grad=True)
+    sigma_model(leaf).sum().backward()
+    np.testing.assert_allclose(leaf.grad, expected, rtol=1e-6)
+
+
 def test_half_precision_of_torch():
     ratings = torch.tensor([-1.0, 2.0, 1.0], dtype=torch.bfloat16)
     assert sigma_human(ratings).dtype == torch.bfloat16

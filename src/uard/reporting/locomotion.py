@@ -20,6 +20,7 @@ HACKING, NOISE, KICK = "mujoco-standard-hacking", "mujoco-standard-noise", "mujo
 DISTORTION, RATING = "mujoco-standard-distortion", "mujoco-standard-rating"
 BONUSES, ABLATION = "mujoco-standard-bonuses", "mujoco-standard-ablation"
 AS_GOOD = 0.03  # by how much the AUROC of a cheaper sigma_m may be lower
+BOUNDS = ("raw", "true reward")
 REMOVED, KEPT, COST = 0.936, 0.9, 0.05  # the paper's best reduction (J16); what is asked of a filter beside it
 METRICS = ("trap_visits", "true_return", "observed_return")
 COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", "uard": "#2c6fbb"}
@@ -70,8 +71,10 @@ def shares(p: Published, r: Row) -> tuple[float | None, float | None]:
 
     Where the raw agent makes less than one hack step per episode a share of it says nothing and is None.
     """
-    raw = _rival(p, r, "raw")
-    honest = _rival(p, r, "raw" if r["region"] == "none" else "true reward")
+    return _compared(p, r, _rival(p, r, "raw"), _rival(p, r, "raw" if r["region"] == "none" else "true reward"))
+
+
+def _compared(p: Published, r: Row, raw: Row | None, honest: Row | None) -> tuple[float | None, float | None]:
     removed = kept = None
     if raw is not None and p.of(raw, "trap_visits").mean >= 1.0:
         removed = 1.0 - p.of(r, "trap_visits").mean / p.of(raw, "trap_visits").mean
@@ -81,7 +84,7 @@ def shares(p: Published, r: Row) -> tuple[float | None, float | None]:
 
 
 def _shares(p: Published, r: Row) -> tuple[str, str]:
-    if r["mitigation"] in ("raw", "true reward"):
+    if r["mitigation"] in BOUNDS:
         return "–", "–"
     removed, kept = ("–" if x is None else f"{100 * x:.1f} %" for x in shares(p, r))
     return removed, kept
@@ -188,7 +191,7 @@ def _distortion(p: Published) -> Table:
 
 def losses(p: Published) -> list[str]:
     """Say where ``uard`` misses what is asked of it in MuJoCo, found by rule."""
-    return _of_hacking(p) + _of_distortion(p)
+    return _of_hacking(p) + _of_noise(p) + _of_distortion(p)
 
 
 def _of_distortion(p: Published) -> list[str]:
@@ -245,6 +248,22 @@ def _of_hacking(p: Published) -> list[str]:
             f"settings{_listed(dear)}."
         )
     return out
+
+
+def _of_noise(p: Published) -> list[str]:
+    missed = []
+    for r in p.rows(NOISE, mitigation="uard"):
+        rows = (p.rows(HACKING, robot="hopper", region="vibration", agent=r["agent"], mitigation=m) for m in BOUNDS)
+        removed, kept = _compared(p, r, *(found[0] if found else None for found in rows))
+        if r["noise"] and ((removed is not None and removed < REMOVED) or (kept is not None and kept < KEPT)):
+            hacks, true = (full(p.of(r, m)) for m in ("trap_visits", "true_return"))
+            missed.append(f"{r['agent']} at {100 * r['noise']:.0f} %: {hacks} hack steps, true return {true}")
+    if not missed:
+        return []
+    return [
+        f"MuJoCo, Hopper, vibration, noisy raters ({_steps(p, NOISE)}): uard removes less than 93.6 % of the hacks or "
+        f"keeps less than 90 % of the honest agent's true return: {'; '.join(missed)}."
+    ]
 
 
 def _listed(names: list[str]) -> str:
