@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Iterable
 from importlib import resources
 from typing import Any
 
@@ -34,8 +35,12 @@ def tables(p: Published) -> list[Table]:
 
 
 def _steps(p: Published, study: str) -> str:
-    budgets = " or ".join(f"{n:,}" for n in sorted({r.cell.steps or 0 for r in p.rows(study)}))
-    return f"{budgets} steps, {p.seeds(study)} seeds" if budgets else ""
+    def each(numbers: Iterable[int]) -> str:
+        return " or ".join(f"{n:,}" for n in sorted(set(numbers)))
+
+    rows = p.rows(study)
+    seeds = each(len(p.per_seed(r, METRICS[0])) for r in rows)
+    return f"{each(r.cell.steps or 0 for r in rows)} steps, {seeds} seeds" if rows else ""
 
 
 def _hacking(p: Published) -> Table:
@@ -122,9 +127,11 @@ def _kick(p: Published) -> Table:
 
 
 def _bonuses(p: Published) -> Table:
+    published = p.rows(BONUSES)
     rows = [
         (r["region"], f"{r['bonus']:g}", r["mitigation"], r["panel"], *(full(p.of(r, m)) for m in METRICS))
-        for r in p.rows(BONUSES)
+        for r in published
+        if len({r["bonus"] for r in published}) > 1  # the usual bonus alone is in the first table
     ]
     return Table(
         f"How large a bonus breaks which mitigation: Hopper, PPO, {_steps(p, BONUSES)}",
@@ -144,6 +151,7 @@ def _ablation(p: Published) -> Table:
         ("region", "doubt", "panel", "steps in the region per episode", "true return", "observed return"),
         tuple(rows),
         3,
+        "Only: the other is left out of U (alpha or beta = 0). lambda_t, which listens to the raters, stays in all three.",
     )
 
 

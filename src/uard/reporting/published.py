@@ -30,7 +30,14 @@ from uard.statistics import Summary
 
 BIN = 10  # episodes
 CURVES = ("observed_return", "trap_visits", "goal")
-FILES = ("grid-deep.json", "games.json", "mujoco.json", "mujoco-distortion.json", "mujoco-rating.json")
+FILES = (
+    "grid-deep.json",
+    "games.json",
+    "mujoco-distortion.json",
+    "mujoco-rating.json",
+    "mujoco-sac.json",
+    "mujoco.json",  # more seeds of cells that are in others too: the last counts
+)
 
 
 def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], command: str) -> dict[str, Any]:
