@@ -21,9 +21,10 @@ HACKING, NOISE, KICK = "mujoco-standard-hacking", "mujoco-standard-noise", "mujo
 DISTORTION, RATING = "mujoco-standard-distortion", "mujoco-standard-rating"
 BONUSES, ABLATION = "mujoco-standard-bonuses", "mujoco-standard-ablation"
 AS_GOOD = 0.03  # by how much the AUROC of a cheaper sigma_m may be lower
-BOUNDS = ("raw", "true reward")
+REFERENCES = ("raw", "true reward")
 REMOVED, KEPT, COST = 0.936, 0.9, 0.05  # the paper's best reduction (J16); what is asked of a filter beside it
 METRICS = ("trap_visits", "true_return", "observed_return")
+HEADS = ("steps in the region per episode", "true return", "observed return")  # of METRICS
 COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", "uard": "#2c6fbb"}
 
 
@@ -54,8 +55,7 @@ def _hacking(p: Published) -> Table:
     return Table(
         f"Hopper and Walker2d with a reward that lies (G6, G7), {_steps(p, HACKING)}, 15 % of steps rated",
         (
-            "task", "agent", "learns from", "panel", "steps in the region per episode", "true return",
-            "observed return", "hacks removed", "true return kept", "deterministic: steps in the region", "true return",
+            "task", "agent", "learns from", "panel", *HEADS, "hacks removed", "true return kept", "deterministic: steps in the region", "true return",
         ),
         tuple(rows),
         4,
@@ -67,8 +67,11 @@ def _hacking(p: Published) -> Table:
 
 
 def _rival(p: Published, r: Row, mitigation: str) -> Row | None:
-    found = p.rows(HACKING, robot=r["robot"], region=r["region"], agent=r["agent"], mitigation=mitigation)
-    return found[0] if found else None
+    return _found(p, robot=r["robot"], region=r["region"], agent=r["agent"], mitigation=mitigation)
+
+
+def _found(p: Published, **labels: Any) -> Row | None:
+    return next(iter(p.rows(HACKING, **labels)), None)
 
 
 def shares(p: Published, r: Row) -> tuple[float | None, float | None]:
@@ -89,7 +92,7 @@ def _compared(p: Published, r: Row, raw: Row | None, honest: Row | None) -> tupl
 
 
 def _shares(p: Published, r: Row) -> tuple[str, str]:
-    if r["mitigation"] in BOUNDS:
+    if r["mitigation"] in REFERENCES:
         return "–", "–"
     removed, kept = ("–" if x is None else f"{100 * x:.1f} %" for x in shares(p, r))
     return removed, kept
@@ -102,7 +105,7 @@ def _noise(p: Published) -> Table:
     ]
     return Table(
         f"Violations against noise (G11): Hopper, vibration, main panel, {_steps(p, NOISE)}",
-        ("agent", "learns from", "noise", "steps in the region per episode", "true return", "observed return"),
+        ("agent", "learns from", "noise", *HEADS),
         tuple(rows),
         3,
         "Noise on every rating, as a share of the bonus. The raw agent does not listen, so noise cannot reach it.",
@@ -116,14 +119,11 @@ def _kick(p: Published) -> Table:
     ]
     return Table(
         f"A state thrown off by +5 (G10): Hopper, vibration, PPO, {_steps(p, KICK)}",
-        (
-            "learns from", "kicked", "at step", "steps in the region per episode", "true return", "observed return",
-            "episode length",
-        ),
+        ("learns from", "kicked", "at step", *HEADS, "episode length"),
         tuple(rows),
         3,
         "The paper kicks at step 500. An episode that ends before was never kicked.",
-    )  # fmt: skip
+    )
 
 
 def _bonuses(p: Published) -> Table:
@@ -135,20 +135,17 @@ def _bonuses(p: Published) -> Table:
     ]
     return Table(
         f"How large a bonus breaks which mitigation: Hopper, PPO, {_steps(p, BONUSES)}",
-        (
-            "region", "bonus", "learns from", "panel", "steps in the region per episode", "true return",
-            "observed return",
-        ),
+        ("region", "bonus", "learns from", "panel", *HEADS),
         tuple(rows),
         4,
-    )  # fmt: skip
+    )
 
 
 def _ablation(p: Published) -> Table:
     rows = [(r["region"], r["variant"], r["panel"], *(full(p.of(r, m)) for m in METRICS)) for r in p.rows(ABLATION)]
     return Table(
         f"Which source does the work (H8): Hopper, PPO with uard, {_steps(p, ABLATION)}",
-        ("region", "doubt", "panel", "steps in the region per episode", "true return", "observed return"),
+        ("region", "doubt", "panel", *HEADS),
         tuple(rows),
         3,
         "Only: the other is left out of U (alpha or beta = 0). lambda_t, which listens to the raters, stays in all three.",
@@ -261,8 +258,8 @@ def _of_hacking(p: Published) -> list[str]:
 def _of_noise(p: Published) -> list[str]:
     missed = []
     for r in p.rows(NOISE, mitigation="uard"):
-        rows = (p.rows(HACKING, robot="hopper", region="vibration", agent=r["agent"], mitigation=m) for m in BOUNDS)
-        removed, kept = _compared(p, r, *(found[0] if found else None for found in rows))
+        rivals = (_found(p, robot="hopper", region="vibration", agent=r["agent"], mitigation=m) for m in REFERENCES)
+        removed, kept = _compared(p, r, *rivals)
         if r["noise"] and ((removed is not None and removed < REMOVED) or (kept is not None and kept < KEPT)):
             hacks, true = (full(p.of(r, m)) for m in ("trap_visits", "true_return"))
             missed.append(f"{r['agent']} at {100 * r['noise']:.0f} %: {hacks} hack steps, true return {true}")

@@ -106,7 +106,7 @@ def bind(job: Job) -> Loop:
 
 @jax.jit
 def _act(policy: Any, observations: Array, keys: Array, t: int) -> Array:
-    return heads.draw(heads.say(policy, observations), keys[t])  # out here, taking a key costs more than the policy
+    return heads.draw(heads.say(policy, observations), keys[t])  # outside, to take a key costs more than the policy
 
 
 @jax.jit
