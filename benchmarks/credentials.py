@@ -1,13 +1,16 @@
-"""Do our agents learn what others' do? CartPole-v1 and Acrobot-v1 beside Stable-Baselines3 and sb3-contrib.
+"""Do our agents learn what others' do? Small and MuJoCo's tasks beside Stable-Baselines3, sb3-contrib and SBX.
 
-    python benchmarks/credentials.py [--seeds 10] [--their-seeds 3] [--only dqn ppo trpo]
-                                     [--tasks CartPole Acrobot] [--json FILE]
+    python benchmarks/credentials.py [--seeds 10] [--their-seeds 3] [--only dqn ppo trpo sac]
+                                     [--tasks CartPole Acrobot Hopper Walker2d] [--ours-only] [--json FILE]
 
 Rows that are in FILE already, and that this call does not make, stay there.
 
 Same budget of environment steps, network (64, 64), batch, buffer, discount. The number is the mean return of the
 training episodes that end in the last fifth of the budget, one per seed; the interval is over seeds (95 %, bootstrap).
 Ours run on our own compiled CartPole and Acrobot, which the tests hold to Gymnasium's; theirs run on Gymnasium's.
+Hopper-v4 and Walker2d-v4 tell the truth here. PPO has the million steps of published results, which stand beside it;
+SAC has the size and the budget of the studies for a CPU, and SBX beside it where that is installed, else
+Stable-Baselines3.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ import json
 import os
 import time
 from collections.abc import Callable
-from importlib import metadata
+from importlib import metadata, util
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +32,14 @@ import uard.training  # noqa: F401  (XLA's flags)
 from uard import __version__
 from uard.statistics import Summary, summarise
 
-BUDGET = {"dqn": 30_000, "ppo": 100_000, "trpo": 100_000}
-TASKS = ("CartPole", "Acrobot")
+SMALL, ROBOTS = ("CartPole", "Acrobot"), ("Hopper", "Walker2d")
+BUDGETS = {
+    **{("dqn", task): 30_000 for task in SMALL},
+    **{(name, task): 100_000 for name in ("ppo", "trpo") for task in SMALL},
+    **{("ppo", task): 1_000_000 for task in ROBOTS},
+    **{("sac", task): 50_000 for task in ROBOTS},
+}
+AGENTS = ("dqn", "ppo", "trpo", "sac")
 GAMMA, RATE = 0.99, 1e-3
 VALUE_SCALE = {("ppo", "CartPole"): 100.0, ("trpo", "CartPole"): 100.0}  # 30 elsewhere
 Returns = list[float]
@@ -43,6 +52,25 @@ def late(ends: np.ndarray, returns: np.ndarray, budget: int) -> float:
 
 
 def ours(name: str, task: str, seeds: int) -> Returns:
+    return (_in_mujoco if task in ROBOTS else _compiled)(name, task, seeds)
+
+
+def _in_mujoco(name: str, task: str, seeds: int) -> Returns:
+    from uard.envs.mujoco import Locomotion
+    from uard.lab.names import continuous_agents
+    from uard.mitigation import named
+    from uard.training import host
+    from uard.training.lanes import LOG
+
+    budget, found = BUDGETS[name, task], []
+    for seed in range(seeds):
+        world = Locomotion(task.lower(), region=None)
+        done = host.run(host.Job(world, continuous_agents(small=name == "sac")[name], named("raw"), seed, budget))
+        found.append(late(done.ends, done.log[:, LOG.index("observed_return")], budget))
+    return found
+
+
+def _compiled(name: str, task: str, seeds: int) -> Returns:
     from uard.agents.policy import PPO, TRPO
     from uard.agents.value import DeepQ
     from uard.envs.classic import Acrobot, CartPole
@@ -57,7 +85,7 @@ def ours(name: str, task: str, seeds: int) -> Returns:
         "ppo": PPO(network, gamma=GAMMA, count_bonus=0.0),
         "trpo": TRPO(network, gamma=GAMMA, count_bonus=0.0),
     }
-    budget = BUDGET[name]
+    budget = BUDGETS[name, task]
     world = (CartPole() if task == "CartPole" else Acrobot()).world()
     loop = off_policy.run if name == "dqn" else on_policy.run
     program = deep.Program(budget // 8, budget)
@@ -72,6 +100,37 @@ def ours(name: str, task: str, seeds: int) -> Returns:
 
 
 def theirs(name: str, task: str, seeds: int) -> Returns:
+    return (_their_sac if name == "sac" else _on_gymnasium)(name, task, seeds)
+
+
+def _their_sac(name: str, task: str, seeds: int) -> Returns:
+    import gymnasium
+    from stable_baselines3.common.monitor import Monitor
+
+    if util.find_spec("sbx"):
+        from sbx import SAC
+    else:
+        from stable_baselines3 import SAC
+    found = []
+    for seed in range(seeds):
+        agent: Any = SAC(
+            "MlpPolicy",
+            Monitor(gymnasium.make(f"{task}-v4")),
+            learning_rate=RATE,
+            batch_size=128,
+            learning_starts=2_000,
+            buffer_size=BUDGETS[name, task],
+            policy_kwargs={"net_arch": [64, 64]},
+            gamma=GAMMA,
+            seed=seed,
+        )
+        episodes = _Episodes()
+        agent.learn(BUDGETS[name, task], callback=episodes)
+        found.append(late(np.array(episodes.ends), np.array(episodes.returns), BUDGETS[name, task]))
+    return found
+
+
+def _on_gymnasium(name: str, task: str, seeds: int) -> Returns:
     import gymnasium
     import torch
     from sb3_contrib import TRPO
@@ -119,8 +178,8 @@ def theirs(name: str, task: str, seeds: int) -> Returns:
                 "MlpPolicy", env, learning_rate=RATE, n_steps=32, batch_size=64, target_kl=0.01, seed=seed, **net
             )
         episodes = _Episodes()
-        agent.learn(BUDGET[name], callback=episodes)
-        found.append(late(np.array(episodes.ends), np.array(episodes.returns), BUDGET[name]))
+        agent.learn(BUDGETS[name, task], callback=episodes)
+        found.append(late(np.array(episodes.ends), np.array(episodes.returns), BUDGETS[name, task]))
     return found
 
 
@@ -143,8 +202,8 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--their-seeds", type=int, default=3)
-    parser.add_argument("--only", nargs="*", default=list(BUDGET), choices=list(BUDGET))
-    parser.add_argument("--tasks", nargs="*", default=list(TASKS), choices=list(TASKS))
+    parser.add_argument("--only", nargs="*", default=list(AGENTS), choices=AGENTS)
+    parser.add_argument("--tasks", nargs="*", default=list(SMALL), choices=[*SMALL, *ROBOTS])
     parser.add_argument("--ours-only", action="store_true")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
@@ -153,9 +212,12 @@ def main() -> None:
         rows = {(r["task"], r["agent"], r["who"]): r for r in json.loads(arguments.json.read_text())["rows"]}
     for name in arguments.only:
         for task in arguments.tasks:
+            if (name, task) not in BUDGETS:
+                continue
             runs: dict[str, tuple[Callable[..., Returns], int]] = {"ours": (ours, arguments.seeds)}
             if not arguments.ours_only:
                 runs["theirs"] = (theirs, arguments.their_seeds)
+            library = "sbx-rl" if name == "sac" and util.find_spec("sbx") else "stable-baselines3"
             for who, (train, seeds) in runs.items():
                 start = time.perf_counter()
                 returns = train(name, task, seeds)
@@ -164,15 +226,16 @@ def main() -> None:
                 took = time.perf_counter() - start
                 print(
                     f"{task:9s} {name:5s} {who:7s} {summary.mean:7.1f} ± {summary.sd:5.1f} [{low:6.1f}, {high:6.1f}] "
-                    f"{seeds} seeds, {BUDGET[name]} steps, {took:.0f} s",
+                    f"{seeds} seeds, {BUDGETS[name, task]} steps, {took:.0f} s",
                     flush=True,
                 )
                 rows[task, name, who] = {
                     "task": task,
                     "agent": name,
                     "who": who,
-                    "budget": BUDGET[name],
-                    "version": __version__ if who == "ours" else metadata.version("stable-baselines3"),
+                    "budget": BUDGETS[name, task],
+                    "version": __version__ if who == "ours" else metadata.version(library),
+                    "library": "uard" if who == "ours" else library,
                     "returns": returns,
                 }
                 if arguments.json:

@@ -168,7 +168,7 @@ def test_a_state_that_is_not_finite_stops_the_run_and_the_last_good_one_stays(tm
 
 def test_ppo_learns_to_stay_up_on_the_honest_hopper():
     agent = PPO(
-        Network(64, 3e-4, 100.0), gamma=0.99, rollout=256, epochs=10, minibatches=32, count_bonus=0.0, entropy=0.0
+        Network(64, 3e-4, 100.0, "tanh"), gamma=0.99, rollout=256, epochs=10, minibatches=32, count_bonus=0.0, entropy=0.0
     )
     done = host.run(Job(LIES.honest(), agent, named("raw"), 0, 40_000))
     first, last = done.log[:50], done.log[-50:]
@@ -177,7 +177,7 @@ def test_ppo_learns_to_stay_up_on_the_honest_hopper():
 
 
 def test_a_reservoir_is_a_uniform_sample_of_all_that_was_rated():
-    kept = transitions.empty(SMALL, 1)
+    kept = transitions.empty(SMALL, 1, 3)
     random = np.random.default_rng(0)
     counts = np.zeros(640)
     for _ in range(200):
@@ -200,9 +200,9 @@ def test_the_model_of_transitions_learns_what_raters_say_and_how_far_that_is_fro
     x[:, -1] = x[:, 1] + 4.0 * hack  # the observed reward
     true = x[:, 1] - 1.5 * hack
     ratings = true[:, None] + random.normal(size=(2048, 3)) * np.where(hack, 1.0, 0.2)[:, None]
-    kept = transitions.empty(spec, 4)
+    kept = transitions.empty(spec, 4, 3)
     transitions.keep(kept, x, ratings, random)
-    model = transitions.init(spec, jax.random.key(0), 4)
+    model = transitions.init(spec, jax.random.key(0), 4, 3)
     model = transitions.fit(spec, model, *kept[:2], kept.seen[0], jax.random.key(1))
     said = transitions.read(spec, model, jax.numpy.asarray(x), 3)
     assert np.sqrt(np.mean((np.asarray(said.mean) - true) ** 2)) < 0.25
@@ -215,17 +215,33 @@ def test_the_model_of_transitions_knows_that_nobody_rated_a_step_with_such_a_bon
     x = random.normal(size=(2048, 4)).astype(np.float32)
     rated, never = x[:, 0] < 0.5, x[:, 0] > 1.0
     x[:, -1] = x[:, 1] + 4.0 * never
-    kept = transitions.empty(spec, 4)
+    kept = transitions.empty(spec, 4, 3)
     transitions.keep(kept, x[rated], x[rated, 1:2] + random.normal(size=(rated.sum(), 3)) * 0.2, random)
-    model = transitions.init(spec, jax.random.key(0), 4)
+    model = transitions.init(spec, jax.random.key(0), 4, 3)
     model = transitions.fit(spec, model, *kept[:2], kept.seen[0], jax.random.key(1))
     count = np.asarray(transitions.read(spec, model, jax.numpy.asarray(x), 3).count)
     assert np.median(count[never]) < 0.2 * np.median(count[rated])
 
 
+def test_raters_who_are_all_noisy_are_still_known_and_the_lowest_of_them_does_not_sink():
+    random = np.random.default_rng(0)
+    spec = TransitionModel(fits=1500)
+    x = random.normal(size=(8192, 4)).astype(np.float32)
+    true = x[:, 1]
+    kept = transitions.empty(spec, 4, 3)
+    transitions.keep(kept, x, true[:, None] + 1.2 * random.normal(size=(8192, 3)), random)
+    model = transitions.init(spec, jax.random.key(0), 4, 3)
+    model = transitions.fit(spec, model, *kept[:2], kept.seen[0], jax.random.key(1))
+    said = transitions.read(spec, model, jax.numpy.asarray(x), 3)
+    assert np.median(said.count) > 3
+    # What the lowest of three such ratings is on average: 0.85 deviations less.
+    assert np.median(np.asarray(said.lowest) - true) > -0.4 * 0.85 * 1.2
+    assert np.median(said.spread) > 0.7
+
+
 def test_without_ratings_the_model_stays_as_it_was():
-    model = transitions.init(SMALL, jax.random.key(0), 3)
-    kept = transitions.empty(SMALL, 3)
+    model = transitions.init(SMALL, jax.random.key(0), 3, 2)
+    kept = transitions.empty(SMALL, 3, 2)
     after = transitions.fit(SMALL, model, *kept[:2], kept.seen[0], jax.random.key(1))
     for a, b in zip(jax.tree.leaves(model.layers), jax.tree.leaves(after.layers), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -156,7 +156,7 @@ def test_sunrise_takes_the_action_with_the_best_mean_plus_deviation():
     observation = jnp.ones((4, 3))
     action = agent.act(state, observation, jax.random.key(1))
     assert action.shape == (4, 2)
-    offered = jax.vmap(lambda k: continuous.draw(continuous.say(state.trained.actor, observation), k)[0])(
+    offered = jax.vmap(lambda k: continuous.draw(continuous.say(agent.network, state.trained.actor, observation), k)[0])(
         jax.random.split(jax.random.key(1), continuous.UCB_ACTIONS)
     )
     values = jnp.stack([agent.values(state, observation, a) for a in offered], 1)

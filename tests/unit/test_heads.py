@@ -61,7 +61,7 @@ def test_draws_have_the_said_mean_and_deviation():
 def test_a_fresh_policy_is_almost_a_standard_normal():
     policy = heads.init(jax.random.key(0), Network(), 5, 2, continuous=True)
     assert isinstance(policy, GaussianPolicy)
-    said = heads.say(policy, jnp.ones((3, 5)))
+    said = heads.say(Network(), policy, jnp.ones((3, 5)))
     assert isinstance(said, Normal)
     assert np.abs(said.mean).max() < 0.1
     np.testing.assert_array_equal(said.log_deviation, 0.0)

@@ -37,11 +37,11 @@ def values(ensemble: Ensemble, weights: Weights, x: jax.Array, **more: Any) -> n
     return np.asarray(networks.values(ensemble, NETWORK, weights, x, KEY, **more))
 
 
-def by_hand(layers: Any, x: np.ndarray) -> np.ndarray:
+def by_hand(layers: Any, x: np.ndarray, activation: Any = lambda x: np.maximum(x, 0)) -> np.ndarray:
     """One stack of layers in NumPy."""
     for i, (weight, bias) in enumerate(layers):
         x = x @ np.asarray(weight) + np.asarray(bias)
-        x = np.maximum(x, 0) if i + 1 < len(layers) else x
+        x = activation(x) if i + 1 < len(layers) else x
     return x
 
 
@@ -53,6 +53,16 @@ def test_every_member_has_a_value_of_every_action(ensemble: Ensemble):
     assert out.dtype == np.float32
     np.testing.assert_array_equal(out, values(ensemble, drawn(ensemble), seen()))
     assert (out != values(ensemble, drawn(ensemble, 1), seen())).any()
+
+
+def test_a_network_with_tanh_by_hand():
+    weights = drawn(SINGLE)
+    curved = Network(hidden=8, value_scale=5.0, activation="tanh")
+    out = np.asarray(networks.values(SINGLE, curved, weights, seen()))
+    layers = jax.tree.map(lambda x: x, weights.layers)
+    np.testing.assert_allclose(out[0], 5.0 * by_hand(weights.layers, np.asarray(seen()), np.tanh), rtol=1e-5, atol=1e-5)
+    with pytest.raises(InvalidValueError, match="activation"):
+        Network(activation="rely")  # type: ignore[arg-type]
 
 
 def test_a_single_network_by_hand():

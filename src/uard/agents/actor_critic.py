@@ -92,7 +92,7 @@ class SoftActorCritic:
 
     def policy(self, state: State, observations: Array) -> Array:
         """Return the log chances of the actions, (B, A)."""
-        return log_policy(state.trained.actor, observations)
+        return log_policy(self.network, state.trained.actor, observations)
 
     def values(self, state: State, observations: Array, key: Array | None = None) -> Array:
         """Return all critics' values (N, B, A)."""
@@ -155,7 +155,7 @@ class SoftActorCritic:
             if q.shape[0] > 1:  # with diversity 0 this costs little, and diversity remains a number
                 critics += self.diversity * gradient_similarity(simplex_gradient(q / scale))
 
-            log_here = log_policy(trained.actor, batch.observation)
+            log_here = log_policy(network, trained.actor, batch.observation)
             scores = prefer_here(lowest(opinions), sigma, batch.observation)
             actor = -soft_value(lax.stop_gradient(scores) / scale, log_here, temperature).mean()
             heat = temperature_loss(trained.log_temperature, lax.stop_gradient(entropy(log_here)), aim)
@@ -214,9 +214,9 @@ def _member(layers: tuple[Layer, ...], i: int) -> tuple[Layer, ...]:
     return jax.tree.map(lambda x: x[i], layers)
 
 
-def log_policy(layers: tuple[Layer, ...], observations: Array) -> Array:
+def log_policy(network: Network, layers: tuple[Layer, ...], observations: Array) -> Array:
     """Return an actor's log chances of discrete actions, (B, A)."""
-    return jax.nn.log_softmax(networks.through(layers, observations))
+    return jax.nn.log_softmax(networks.through(layers, observations, network.activation))
 
 
 def entropy(log_chances: Array) -> Array:

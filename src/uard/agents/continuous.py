@@ -125,9 +125,9 @@ class ContinuousActorCritic:
     def act(self, state: State, observations: Array, key: Array) -> Array:
         """Draw actions (B, D) within (-1, 1); with ``ucb``, the best of several by mean + ucb deviations."""
         if not self.ucb:
-            return draw(say(state.trained.actor, observations), key)[0]
+            return draw(say(self.network, state.trained.actor, observations), key)[0]
         keys = jax.random.split(key, UCB_ACTIONS)
-        offered = jax.vmap(lambda k: draw(say(state.trained.actor, observations), k)[0])(keys)
+        offered = jax.vmap(lambda k: draw(say(self.network, state.trained.actor, observations), k)[0])(keys)
         mu, sigma = networks.mean_and_deviation(
             jax.vmap(lambda a: self.values(state, observations, a), out_axes=1)(offered)
         )
@@ -136,7 +136,7 @@ class ContinuousActorCritic:
 
     def greedy(self, state: State, observations: Array) -> Array:
         """Return the policy's middle actions (B, D)."""
-        return jnp.tanh(say(state.trained.actor, observations).mean)
+        return jnp.tanh(say(self.network, state.trained.actor, observations).mean)
 
     def update(
         self, state: State, batch: Batch, judge: Judge, prefer: Callable[[Array, Array], Array], key: Array
@@ -153,7 +153,7 @@ class ContinuousActorCritic:
         next_key, here_key, pair_key, cql_key = jax.random.split(key, 4)
         scale = self.network.value_scale
         temperature = jnp.exp(state.trained.log_temperature)
-        action_next, log_next = draw(say(state.trained.actor, batch.following), next_key)
+        action_next, log_next = draw(say(self.network, state.trained.actor, batch.following), next_key)
         following = self._values(Weights(state.target, state.prior), batch.following, action_next)
         trust = backup_weight(following, self.backup_temperature) if self.backup_temperature else 1.0
         if self.pair:
@@ -187,7 +187,7 @@ class ContinuousActorCritic:
                     self.conservative * self._gap(weights, trained.actor, batch, q, cql_key).mean(1).sum() / scale
                 )
 
-            action, log_here = draw(say(trained.actor, batch.observation), here_key)
+            action, log_here = draw(say(self.network, trained.actor, batch.observation), here_key)
             opinions = self._values(Weights(lax.stop_gradient(frozen), state.prior), batch.observation, action)
             mu, doubt = networks.mean_and_deviation(opinions)
             climbed = prefer(mu if self.pair else opinions.min(0), doubt)
@@ -207,7 +207,7 @@ class ContinuousActorCritic:
         uniform_key, policy_key = jax.random.split(key)
         rows, motors = batch.action.shape
         uniform = jax.random.uniform(uniform_key, (CQL_ACTIONS, rows, motors), minval=-1.0, maxval=1.0)
-        said = lax.stop_gradient(say(actor, batch.observation))
+        said = lax.stop_gradient(say(self.network, actor, batch.observation))
         drawn, logs = jax.vmap(lambda k: draw(said, k))(jax.random.split(policy_key, CQL_ACTIONS))
         offered = jnp.concatenate([uniform, lax.stop_gradient(drawn)])
         density = jnp.concatenate([jnp.full((CQL_ACTIONS, rows), -motors * math.log(2.0)), lax.stop_gradient(logs)])
@@ -225,9 +225,9 @@ class State(NamedTuple):
     optimiser: Any
 
 
-def say(layers: tuple[Layer, ...], observations: Array) -> Normal:
+def say(network: Network, layers: tuple[Layer, ...], observations: Array) -> Normal:
     """Return the normal, before squashing, of (B, F) observations."""
-    mean, log_deviation = jnp.split(networks.through(layers, observations), 2, -1)
+    mean, log_deviation = jnp.split(networks.through(layers, observations, network.activation), 2, -1)
     return Normal(mean, jnp.clip(log_deviation, *LOG_DEVIATIONS))
 
 

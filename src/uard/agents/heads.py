@@ -43,11 +43,11 @@ def init(key: Array, network: Network, features: int, actions: int, continuous: 
     return GaussianPolicy(layers, jnp.zeros(actions, jnp.float32)) if continuous else layers
 
 
-def say(policy: Any, observations: Array) -> Said:
+def say(network: Network, policy: Any, observations: Array) -> Said:
     """Return what a policy says of (B, features) observations."""
     if isinstance(policy, GaussianPolicy):
-        return Normal(networks.through(policy.layers, observations), policy.log_deviation)
-    return networks.through(policy, observations)
+        return Normal(networks.through(policy.layers, observations, network.activation), policy.log_deviation)
+    return networks.through(policy, observations, network.activation)
 
 
 def draw(said: Said, key: Array) -> Array:

@@ -160,11 +160,11 @@ class PolicyGradient:
 
     def act(self, state: State, observations: Array, key: Array) -> Array:
         """Draw an action for each of (B, features) observations; continuous ones have no bounds."""
-        return heads.draw(heads.say(state.policy, observations), key)
+        return heads.draw(heads.say(self.network, state.policy, observations), key)
 
     def greedy(self, state: State, observation: Array) -> Array:
         """Return the likeliest action for one observation (features,)."""
-        return heads.likeliest(heads.say(state.policy, observation[None]))[0]
+        return heads.likeliest(heads.say(self.network, state.policy, observation[None]))[0]
 
     def values(self, state: State, observations: Array, key: Array) -> Array:
         """Return all members' values (N, B) of observations (B, features)."""
@@ -258,13 +258,13 @@ class PPO(PolicyGradient):
     def update(self, state: State, experience: Experience, key: Array) -> tuple[State, Watched]:
         """Take ``epochs`` times ``minibatches`` steps of Adam on policy and critic."""
         batch = self._batch(experience)
-        old = log_probability(heads.say(state.policy, batch.observation), batch.action)
+        old = log_probability(heads.say(self.network, state.policy, batch.observation), batch.action)
 
         def one(s: State, x: tuple[Array, Array]) -> tuple[State, tuple[Array, Array]]:
             part, before = _take(batch, x[0]), old[x[0]]
 
             def loss(policy: Layers, layers: Layers) -> tuple[Array, tuple[Array, Array]]:
-                said = heads.say(policy, part.observation)
+                said = heads.say(self.network, policy, part.observation)
                 gain = clipped_surrogate(log_probability(said, part.action) - before, part.advantage, self.clip)
                 gain = (part.weight * (gain + self.entropy * entropy(said))).mean()
                 fit, watched = self._critic_loss(self.ensemble, Weights(layers, s.value.prior), part, x[1])
@@ -316,7 +316,7 @@ class TRPO(PolicyGradient):
     def improved(self, policy: Layers, batch: Batch) -> Layers:
         """Return the policy after one step of at most ``delta``; the same if no step of the line search improves it."""
         theta, shape = ravel_pytree(policy)
-        said_of = _said_of(shape, batch)
+        said_of = _said_of(self.network, shape, batch)
         old = said_of(theta)
 
         def gain(theta: Array) -> Array:
@@ -411,7 +411,7 @@ class CPO(TRPO):
             excess: By how much the old policy's cost per step is above the budget.
         """
         theta, shape = ravel_pytree(policy)
-        said_of = _said_of(shape, batch)
+        said_of = _said_of(self.network, shape, batch)
         old = said_of(theta)
 
         def gain(theta: Array) -> Array:
@@ -571,8 +571,8 @@ def line_search(
     return jnp.where(found, theta + factor * step, theta)
 
 
-def _said_of(shape: Callable[[Array], Any], batch: Batch) -> Callable[[Array], Any]:
-    return lambda theta: heads.say(shape(theta), batch.observation)
+def _said_of(network: Network, shape: Callable[[Array], Any], batch: Batch) -> Callable[[Array], Any]:
+    return lambda theta: heads.say(network, shape(theta), batch.observation)
 
 
 def _flat(x: Array) -> Array:

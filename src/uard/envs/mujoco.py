@@ -22,6 +22,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -111,7 +112,7 @@ class Vibration:
 
     shaking: float = 1.5
     speed: float = 0.5
-    bonus: float = 4.0
+    bonus: float = 6.0
     penalty: float = 1.5
 
     def __post_init__(self) -> None:
@@ -305,8 +306,9 @@ class Physics:
         self._time = np.zeros(copies, np.int64)
         n = self._model.nv
         self._position, self._velocity, self._acceleration = (np.zeros((copies, n)) for _ in range(3))
-        self._parts = [p for p in np.array_split(np.arange(copies), threads) if len(p)]
-        self._pool = ThreadPoolExecutor(len(self._parts)) if len(self._parts) > 1 else None
+        cuts = np.linspace(0, copies, min(threads, copies) + 1).astype(int)
+        self._parts = [self._data[a:b] for a, b in pairwise(cuts)]
+        self._pool = ThreadPoolExecutor(len(self._parts) - 1) if len(self._parts) > 1 else None
         for i in range(copies):
             self.reset(i)
 
@@ -320,13 +322,22 @@ class Physics:
         self._position[i], self._velocity[i] = data.qpos, data.qvel
         self._time[i] = 0
 
-    def _advance(self, part: Array, actions: Array) -> None:
-        step, m = self._mujoco.mj_step, self._model
-        for i in part:
-            data = self._data[i]
-            data.ctrl[:] = actions[i]
-            step(m, data, SUBSTEPS)
+    def _advance(self, actions: Array) -> None:
+        for data, action in zip(self._data, actions, strict=True):
+            data.ctrl[:] = action
+        others = [self._pool.submit(self._integrate, part) for part in self._parts[1:]] if self._pool else []
+        self._integrate(self._parts[0])
+        for other in others:
+            other.result()
+        for i, data in enumerate(self._data):
             self._position[i], self._velocity[i], self._acceleration[i] = data.qpos, data.qvel, data.qacc
+
+    def _integrate(self, part: list[Any]) -> None:
+        # Nothing else in this loop: MuJoCo lets go of Python's lock while it steps, and threads that touch arrays
+        # between steps wait for each other most of the time.
+        step, m = self._mujoco.mj_step, self._model
+        for data in part:
+            step(m, data, SUBSTEPS)
 
     def observe(self) -> Array:
         """Return the observations of all copies, (E, features)."""
@@ -347,10 +358,7 @@ class Physics:
             worst = actions.ravel()[np.argmax(np.where(np.isnan(actions), np.inf, np.abs(actions)))]
             raise _checks.InvalidValueError("actions", float(worst), "within [-1, 1]")
         before = self._position[:, 0].copy()
-        if self._pool:
-            list(self._pool.map(lambda part: self._advance(part, actions), self._parts))
-        else:
-            self._advance(self._parts[0], actions)
+        self._advance(actions)
         finite = np.isfinite(self._position).all(1) & np.isfinite(self._velocity).all(1)
         if not finite.all():
             i = int(np.argmin(finite))

@@ -1,9 +1,11 @@
 """What a learner in a continuous world knows of its raters: a sample of rated steps, and a model for all others.
 
 No step comes twice, so there are no running means. ``Reservoir`` is a uniform sample of all steps rated so far (it must
-not forget what honest steps look like when the agent no longer takes them); ``TransitionModel`` regresses what was said
-on (s, a, s', observed reward). sigma_h of a step is composed at use from the predicted ratings and the reward that was
-observed, which tells hacks apart far better than a predicted spread.
+not forget what honest steps look like when the agent no longer takes them); ``TransitionModel`` regresses what each
+rater said, and how far apart they were, on (s, a, s', observed reward). sigma_h of a step is composed at use from the
+predicted ratings and the reward that was observed, which tells hacks apart far better than a predicted spread. The
+lowest rating is that of the rater who is predicted to say least: what the lowest of several noisy ratings is on average
+sinks with the noise, and an agent that can end its episode then prefers to fall.
 """
 
 from __future__ import annotations
@@ -23,7 +25,6 @@ from uard import _checks
 from uard.mitigation import Feedback, Mitigation
 from uard.networks import Layer, descend, mlp, through
 
-SAID = ("mean", "lowest", "spread")
 QUERIES = ("random", "doubtful")  # which steps are rated
 
 
@@ -37,7 +38,8 @@ class TransitionModel:
         learning_rate: Adam's step size.
         fits: Minibatches per fit; there is one fit per 2048 environment steps.
         batch: Rated steps per minibatch.
-        prior_scale: Size of the fixed random functions, in units of the ratings' deviation, > 0.
+        prior_scale: Size of the fixed random functions, in units of the ratings' deviation, > 0. It says how much is
+            unknown before anybody rates: where noise makes the members differ by as much, nothing counts as known.
         capacity: Rated steps kept.
     """
 
@@ -46,7 +48,7 @@ class TransitionModel:
     learning_rate: float = 1e-3
     fits: int = 200
     batch: int = 256
-    prior_scale: float = 0.3
+    prior_scale: float = 1.0
     capacity: int = 16_384
 
     def __post_init__(self) -> None:
@@ -65,7 +67,7 @@ class Reservoir(NamedTuple):
 
     Attributes:
         inputs: (M, features) of the steps.
-        heard: (M, len(SAID)).
+        heard: (M, K + 1), what each rater said, and their deviation.
         seen: (1,), how many steps were rated so far.
     """
 
@@ -80,9 +82,14 @@ def features(observation: Any, action: Any, following: Any, reward: Any) -> Any:
     return xp.concatenate([observation, action, following - observation, reward[..., None]], -1)
 
 
-def empty(spec: TransitionModel, width: int) -> Reservoir:
+def width(features: int, actions: int) -> int:
+    """Return how many features of a step there are."""
+    return 2 * features + actions + 1
+
+
+def empty(spec: TransitionModel, width: int, raters: int) -> Reservoir:
     """Return a reservoir of nothing."""
-    inputs, heard = (np.zeros((spec.capacity, w), np.float32) for w in (width, len(SAID)))
+    inputs, heard = (np.zeros((spec.capacity, w), np.float32) for w in (width, raters + 1))
     return Reservoir(inputs, heard, np.zeros(1, np.int64))
 
 
@@ -90,7 +97,7 @@ def keep(kept: Reservoir, inputs: np.ndarray, ratings: np.ndarray, random: np.ra
     """Put rated steps into the sample [Vitter 1985, algorithm R]; ratings (B, K)."""
     capacity = len(kept.inputs)
     spread = ratings.std(1, ddof=ddof) if ratings.shape[1] > 1 else np.zeros(len(ratings))
-    heard = np.stack([ratings.mean(1), ratings.min(1), spread], 1)
+    heard = np.column_stack([ratings, spread])
     numbers = kept.seen[0] + np.arange(len(inputs))
     places = np.where(numbers < capacity, numbers, random.integers(0, numbers + 1))
     for place, x, y in zip(places, inputs, heard, strict=True):  # in order: a later one may take an earlier's place
@@ -133,18 +140,18 @@ class Model(NamedTuple):
     scale: Array
 
 
-def init(spec: TransitionModel, key: Array, width: int) -> Model:
+def init(spec: TransitionModel, key: Array, width: int, raters: int) -> Model:
     """Draw a fresh model."""
     own, fixed = jax.random.split(key)
-    layers = mlp(own, (width, spec.hidden, spec.hidden, len(SAID)), spec.members, last_gain=0.1)
-    prior = mlp(fixed, (width, spec.hidden, len(SAID)), spec.members)
+    layers = mlp(own, (width, spec.hidden, spec.hidden, raters + 1), spec.members, last_gain=0.1)
+    prior = mlp(fixed, (width, spec.hidden, raters + 1), spec.members)
     zeros, ones = jnp.zeros(width, jnp.float32), jnp.ones(width, jnp.float32)
-    location = jnp.zeros(len(SAID), jnp.float32)
+    location = jnp.zeros(raters + 1, jnp.float32)
     return Model(layers, prior, optax.adam(spec.learning_rate).init(layers), zeros, ones, location, jnp.float32(1.0))
 
 
 def _predict(spec: TransitionModel, layers: Any, prior: Any, inputs: Array) -> Array:
-    """Return (members, B, len(SAID)), in units of the ratings' deviation."""
+    """Return (members, B, K + 1), in units of the ratings' deviation."""
     return through(layers, inputs) + spec.prior_scale * lax.stop_gradient(through(prior, inputs))
 
 
@@ -162,8 +169,9 @@ def read(spec: TransitionModel, model: Model, inputs: Array, raters: int) -> Fee
     before = spec.prior_scale**2 * through(model.prior, x).var(0, ddof=1).mean(-1)
     after = out.var(0, ddof=1).mean(-1)
     count = jnp.maximum(before / jnp.maximum(after, 1e-6) - 1.0, 0.0)
-    mean, lowest, spread = jnp.moveaxis(model.location + model.scale * out.mean(0), -1, 0)
-    return Feedback(count, mean, lowest, jnp.maximum(spread, 0.0), inputs[:, -1], jnp.asarray(raters, jnp.float32))
+    said = model.location + model.scale * out.mean(0)
+    ratings, spread = said[:, :-1], jnp.maximum(said[:, -1], 0.0)
+    return Feedback(count, ratings.mean(1), ratings.min(1), spread, inputs[:, -1], jnp.asarray(raters, jnp.float32))
 
 
 @partial(jax.jit, static_argnames="spec")
@@ -200,7 +208,8 @@ def fit(spec: TransitionModel, model: Model, inputs: Array, heard: Array, seen: 
     centre, width = moments(inputs)
     location, deviation = moments(heard)
     width = jnp.where(width > 1e-6, width, 1.0)
-    scale = jnp.where(deviation[0] > 1e-6, deviation[0], 1.0)
+    typical = deviation[:-1].mean()
+    scale = jnp.where(typical > 1e-6, typical, 1.0)
     model = model._replace(centre=centre, width=width, location=location, scale=scale)
 
     def one(carry: tuple[Any, Any], k: Array) -> tuple[tuple[Any, Any], None]:

@@ -25,6 +25,7 @@ from uard.mitigation import Mitigation, Raw
 # Raise this when training code changes what a cell means: old results are then not found, never mixed in.
 RESULTS = 2
 STEPS = 1_000_000
+LATER = {"later": True}  # of a field that older results do not know; at its default it is no part of a key
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,9 @@ class Cell:
     episodes: int = 500
     ddof: int = 0
     snapshots: int = 0
-    feedback: RatingModel | TransitionModel | None = None
-    steps: int | None = None
-    query: str = "random"
+    feedback: RatingModel | TransitionModel | None = field(default=None, metadata=LATER)
+    steps: int | None = field(default=None, metadata=LATER)
+    query: str = field(default="random", metadata=LATER)
 
     def __post_init__(self) -> None:
         """Check everything; forget what cannot matter.
@@ -112,12 +113,8 @@ class Cell:
             object.__setattr__(self, name, kind(getattr(self, name)))
 
     def config(self) -> dict[str, Any]:
-        """Return the whole configuration as plain data; without what came later where it is left out."""
-        config = plain(self)
-        for name, left_out in (("feedback", None), ("steps", None), ("query", "random")):
-            if config[name] == left_out:
-                del config[name]
-        return config
+        """Return the whole configuration as plain data."""
+        return plain(self)
 
     @cached_property
     def key(self) -> str:
@@ -172,12 +169,13 @@ def _fields(cls: type) -> tuple[dataclasses.Field[Any], ...]:
 
 
 def plain(value: Any) -> Any:
-    """Turn (nested) dataclasses into dictionaries that name their class."""
+    """Turn (nested) dataclasses into dictionaries that name their class; see ``LATER``."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         cls = type(value)
-        fields = {f.name: plain(getattr(value, f.name)) for f in _fields(cls)}
+        held = ((f, getattr(value, f.name)) for f in _fields(cls))
+        fields = {f.name: plain(v) for f, v in held if not (f.metadata.get("later") and v == f.default)}
         return {"class": f"{cls.__module__}.{cls.__qualname__}", **fields}
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]

@@ -77,7 +77,7 @@ def continuous_agents(small: bool = False) -> dict[str, Any]:
     Args:
         small: 64 units and batches of 128 for the actor-critic family, for a CPU; else 256 and 256.
     """
-    one = Network(64, 3e-4, 100.0)  # values are as large as 1 / (1 - gamma)
+    one = Network(64, 3e-4, 100.0, "tanh")  # values are as large as 1 / (1 - gamma)
     shared: dict[str, Any] = {"gamma": 0.99, "rollout": 256, "epochs": 10, "minibatches": 32, "count_bonus": 0.0}
     critic: dict[str, Any] = {"network": Network(256, 3e-4, 1.0)}
     if small:

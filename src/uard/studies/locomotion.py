@@ -18,7 +18,8 @@ from uard.studies.paper import PANELS, RAW
 REGIONS = {"vibration": Vibration, "posture": Posture}
 RATED = 0.15
 EARLY = 100  # few agents of the smaller sizes still stand at step 500
-NOISE_UNIT = 4.0  # the paper's noise is in per cent, of what it does not say: of the bonus, here
+NOISE_UNIT = Vibration().bonus  # the paper's noise is in per cent, of what it does not say: of the bonus, here
+RIVALS = ("mean-of-annotations", "worst-of-annotations", "lcb")
 
 
 def _cell(environment: Locomotion, mitigation: Any, agent: Any, steps: int, **more: Any) -> Cell:
@@ -56,7 +57,7 @@ class Scale:
 
 ALL = tuple(name for name in continuous_agents() if name != "cpo-oracle")
 SMOKE = Scale("smoke", 4_096, 2_560, True, ("ppo", "sac"), ("hopper",))
-STANDARD = Scale("standard", 150_000, 50_000, True, ALL)
+STANDARD = Scale("standard", 200_000, 100_000, True, ALL)
 PAPER = Scale("paper", 1_000_000, 1_000_000, False, ALL)
 
 
@@ -95,13 +96,17 @@ def bonuses(scale: Scale) -> tuple[Row, ...]:
         )
         for which, region in REGIONS.items()
         for bonus in (4.0, 6.0, 8.0)
-        for mitigation in ("uard-operator", "worst-of-annotations", "uard")
-        for panel in PANELS
+        for mitigation in ("raw", "uard-operator", "worst-of-annotations", "uard")
+        for panel in (PANELS if named(mitigation).reads_feedback else PANELS[:1])
     )
 
 
 def noise(scale: Scale) -> tuple[Row, ...]:
-    """Violations against rater noise of 0, 10, 20 and 30 % of the bonus (G11)."""
+    """Violations against rater noise of 0, 10, 20 and 30 % of the bonus (G11), Hopper, vibration.
+
+    Every agent by itself, PPO and SAC with ``uard``, PPO also with what else listens to raters.
+    """
+    heard = {"ppo": ("uard", *RIVALS), "sac": ("uard",)}
     return tuple(
         row(
             _cell(Locomotion(), named(mitigation), agent, steps, noise=share * NOISE_UNIT),
@@ -110,8 +115,7 @@ def noise(scale: Scale) -> tuple[Row, ...]:
             noise=share,
         )
         for name, (agent, steps) in scale.agents.items()
-        if name in ("ppo", "sac")
-        for mitigation in ("raw", "uard")
+        for mitigation in ("raw", *heard.get(name, ()))
         for share in (0.0, 0.1, 0.2, 0.3)
     )
 

@@ -197,6 +197,15 @@ class Book:
         return np.concatenate([log, np.array(self.rows).reshape(-1, len(LOG) + 1)])
 
 
+def unheard(job: Job) -> tuple[Any, Any]:
+    """Return a fresh model of the ratings and a reservoir without any; () and () for who asks nobody."""
+    if not job.listens:
+        return (), ()
+    width, raters = transitions.width(job.spec.features, job.spec.actions), job.fixed.raters
+    model = transitions.init(job.feedback, key_of(job.seed, MODEL), width, raters)
+    return model, transitions.empty(job.feedback, width, raters)
+
+
 def record(job: Job, live: Live, steps: list[Moved], inputs: np.ndarray, number: int) -> None:
     """Put the rated fraction of (T, E) steps to the panel, and keep what it says."""
     random = generator(job.seed, PANEL, number)

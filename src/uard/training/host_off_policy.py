@@ -42,14 +42,12 @@ class Kept(NamedTuple):
 def bind(job: Job) -> Loop:
     """Return a run's loop; a piece is ``PIECE`` steps."""
     agent, spec = job.agent, job.spec
-    width = 2 * spec.features + spec.actions + 1
+    width = transitions.width(spec.features, spec.actions)
     slots = min(agent.buffer, -(-job.steps // PIECE) * PIECE)
     fixed = job.fixed
 
     def start(physics: Physics) -> Live:
-        listens = job.listens
-        model = transitions.init(job.feedback, host.key_of(job.seed, host.MODEL), width) if listens else ()
-        reservoir = transitions.empty(job.feedback, width) if listens else ()
+        model, reservoir = host.unheard(job)
         sizes = (spec.features,), (spec.actions,), (spec.features,), ()
         buffer = Buffer(*(jnp.zeros((slots, *size), jnp.float32) for size in sizes), terminated=jnp.zeros(slots, bool))
         return Live(

@@ -16,6 +16,7 @@ from uard.agents.policy import Experience, PolicyGradient
 from uard.envs.mujoco import Moved, Physics
 from uard.feedback import transitions
 from uard.mitigation import Evidence, as_column
+from uard.networks import Network
 from uard.training import host
 from uard.training.deep import all_finite
 from uard.training.host import Book, Fixed, Job, Live, Loop, Norm
@@ -26,15 +27,15 @@ def bind(job: Job) -> Loop:
     """Return a run's loop; a piece is a rollout."""
     agent, spec = job.agent, job.spec
     copies, length = agent.envs, agent.rollout
-    width = 2 * spec.features + spec.actions + 1
+    width = transitions.width(spec.features, spec.actions)
 
     def start(physics: Physics) -> Live:
-        listens = job.listens
+        model, reservoir = host.unheard(job)
         return Live(
             agent=agent.init(host.key_of(job.seed, host.INIT), spec.features, spec.actions, continuous=True),
             norm=Norm.start(spec.features),
-            model=transitions.init(job.feedback, host.key_of(job.seed, host.MODEL), width) if listens else (),
-            reservoir=transitions.empty(job.feedback, width) if listens else (),
+            model=model,
+            reservoir=reservoir,
             extra=(),
             physics=physics.save(),
             sums=np.zeros((copies, len(LOG))),
@@ -48,7 +49,7 @@ def bind(job: Job) -> Loop:
         book = Book(live.sums, int(live.steps))
         here, actions, steps = [physics.observe()], [], []
         for t in range(length):
-            action = np.asarray(_act(live.agent.policy, live.norm.of(here[-1]), keys, t))
+            action = np.asarray(_act(live.agent.policy, live.norm.of(here[-1]), keys, t, network=agent.network))
             moved = physics.step(np.clip(action, -1.0, 1.0))
             book.write(moved)
             steps.append(moved)
@@ -95,7 +96,7 @@ def bind(job: Job) -> Loop:
         )
 
     def act(live: Live, observations: np.ndarray) -> np.ndarray:
-        return np.asarray(_likeliest(live.agent, live.norm.of(observations)))
+        return np.asarray(_likeliest(live.agent.policy, live.norm.of(observations), network=agent.network))
 
     def values(live: Live, observations: np.ndarray) -> np.ndarray:
         key = host.key_of(job.seed, host.EVALUATION)  # of dropout
@@ -104,14 +105,15 @@ def bind(job: Job) -> Loop:
     return Loop(copies, start, advance, act, values)
 
 
-@jax.jit
-def _act(policy: Any, observations: Array, keys: Array, t: int) -> Array:
-    return heads.draw(heads.say(policy, observations), keys[t])  # outside, to take a key costs more than the policy
+@partial(jax.jit, static_argnames="network")
+def _act(policy: Any, observations: Array, keys: Array, t: int, *, network: Network) -> Array:
+    # The key is taken here: outside, that costs more than the policy.
+    return heads.draw(heads.say(network, policy, observations), keys[t])
 
 
-@jax.jit
-def _likeliest(state: Any, observations: Array) -> Array:
-    return heads.likeliest(heads.say(state.policy, observations))
+@partial(jax.jit, static_argnames="network")
+def _likeliest(policy: Any, observations: Array, *, network: Network) -> Array:
+    return heads.likeliest(heads.say(network, policy, observations))
 
 
 @partial(jax.jit, static_argnames="agent")
