@@ -17,6 +17,7 @@ from uard.agents.policy import CPO, PPO, TRPO
 from uard.envs.mujoco import Kick, Locomotion, Spikes, Vibration
 from uard.feedback import transitions
 from uard.feedback.transitions import TransitionModel
+from uard.lab.names import continuous_agents
 from uard.mitigation import named
 from uard.networks import Ensemble, Network
 from uard.training import host
@@ -167,9 +168,7 @@ def test_a_state_that_is_not_finite_stops_the_run_and_the_last_good_one_stays(tm
 
 
 def test_ppo_learns_to_stay_up_on_the_honest_hopper():
-    agent = PPO(
-        Network(64, 3e-4, 100.0, "tanh"), gamma=0.99, rollout=256, epochs=10, minibatches=32, count_bonus=0.0, entropy=0.0
-    )
+    agent = continuous_agents()["ppo"]
     done = host.run(Job(LIES.honest(), agent, named("raw"), 0, 40_000))
     first, last = done.log[:50], done.log[-50:]
     assert last[:, 4].mean() > 3 * first[:, 4].mean()

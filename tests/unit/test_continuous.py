@@ -156,9 +156,9 @@ def test_sunrise_takes_the_action_with_the_best_mean_plus_deviation():
     observation = jnp.ones((4, 3))
     action = agent.act(state, observation, jax.random.key(1))
     assert action.shape == (4, 2)
-    offered = jax.vmap(lambda k: continuous.draw(continuous.say(agent.network, state.trained.actor, observation), k)[0])(
-        jax.random.split(jax.random.key(1), continuous.UCB_ACTIONS)
-    )
+    said = continuous.say(agent.network, state.trained.actor, observation)
+    keys = jax.random.split(jax.random.key(1), continuous.UCB_ACTIONS)
+    offered = jax.vmap(lambda k: continuous.draw(said, k)[0])(keys)
     values = jnp.stack([agent.values(state, observation, a) for a in offered], 1)
     score = values.mean(0) + values.std(0, ddof=1)
     for i in range(4):

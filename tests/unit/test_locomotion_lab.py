@@ -45,6 +45,10 @@ def test_a_cell_knows_what_matters_of_it():
     raw = cell(mitigation=Raw(), panel="appendix", rated=0.5, query="doubtful")
     assert raw.key == cell(mitigation=Raw()).key, "nobody is asked"
     assert "steps" not in Cell().config(), "keys of the grids' cells are what they were"
+    curved = dataclasses.replace(TINY, network=dataclasses.replace(TINY.network, activation="tanh"))
+    assert "activation" not in cell().config()["agent"]["network"], "and of deep agents with ReLU"
+    assert cell(agent=curved).config()["agent"]["network"]["activation"] == "tanh"
+    assert cell(agent=curved).key != cell().key
 
 
 @pytest.mark.parametrize(
@@ -121,12 +125,35 @@ def test_every_study_is_shown_by_a_table_with_a_line_for_each_row():
         "derived": {"deterministic": [[1, 2], [3, 4]]},
     }
     cells = {r.cell.key: seeds for s in studies for r in s.rows}
-    tables = shown.tables(Published(every(), [{"results": RESULTS, "cells": cells}]))
+    every_table = shown.tables(Published(every(), [{"results": RESULTS, "cells": cells}]))
+    tables = [t for t in every_table if not t.title.startswith("The same")]
+    assert len(every_table) == len(tables) + 1
     assert sorted(len(t.rows) for t in tables) == sorted(len(s.rows) for s in studies)
     for table in tables:
         assert {len(r) for r in table.rows} == {len(table.columns)}
         assert len({r[: table.labels] for r in table.rows}) == len(table.rows), "labels tell rows apart"
         assert "2 seeds" in table.title
+
+
+def test_shares_of_all_settings_together_by_hand():
+    (study,) = (s for s in locomotion.studies(locomotion.STANDARD) if s.name == shown.HACKING)
+    rows = study.where(robot="hopper", agent="ppo")
+    hacks = {"raw": [100.0, 300.0], "true reward": [0.0, 0.0], "uard": [1.0, 3.0], "uard-paper": [50.0, 0.0]}
+    true = {"raw": [-5.0, -5.0], "true reward": [400.0, 200.0], "uard": [300.0, 250.0], "uard-paper": [40.0, 40.0]}
+    cells = {
+        r.cell.key: {"seeds": [0, 1], "metrics": {"trap_visits": hacks[m], "true_return": true[m]}}
+        for r in rows
+        for m in [r["mitigation"]]
+    }
+    p = Published(every(), [{"results": RESULTS, "cells": cells}])
+    found = shown.pooled(p, "hopper", "ppo", "uard")
+    assert found is not None
+    removed, kept = found
+    np.testing.assert_allclose(removed, [0.99, 0.99])
+    np.testing.assert_allclose(kept, [0.75, 1.25])
+    del cells[study.one(**dict(rows[-1].labels)).cell.key]
+    assert shown.pooled(Published(every(), [{"results": RESULTS, "cells": cells}]), "hopper", "ppo", "uard") is None
+    assert shown.pooled(p, "walker2d", "ppo", "uard") is None
 
 
 def test_the_film_has_a_strip_for_each_policy_and_says_what_it_is():

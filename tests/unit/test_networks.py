@@ -59,7 +59,6 @@ def test_a_network_with_tanh_by_hand():
     weights = drawn(SINGLE)
     curved = Network(hidden=8, value_scale=5.0, activation="tanh")
     out = np.asarray(networks.values(SINGLE, curved, weights, seen()))
-    layers = jax.tree.map(lambda x: x, weights.layers)
     np.testing.assert_allclose(out[0], 5.0 * by_hand(weights.layers, np.asarray(seen()), np.tanh), rtol=1e-5, atol=1e-5)
     with pytest.raises(InvalidValueError, match="activation"):
         Network(activation="rely")  # type: ignore[arg-type]
@@ -136,7 +135,7 @@ def test_dropout_keeps_the_expectation_of_a_linear_part():
     """With one hidden layer the output is linear in what is dropped."""
     ensemble = Ensemble("dropout", 5, dropout=0.3)
     layers = networks.mlp(KEY, (FEATURES, 64, 2))
-    out = networks._dropped(ensemble, layers, seen(), KEY, 4000)
+    out = networks._dropped(ensemble, Network(), layers, seen(), KEY, 4000)
     plain = by_hand(layers, seen())
     error = np.asarray(out).std(0) / np.sqrt(4000)
     assert (abs(np.asarray(out).mean(0) - plain) < 5 * error).all()

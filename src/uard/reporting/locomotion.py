@@ -30,9 +30,8 @@ COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", 
 
 def tables(p: Published) -> list[Table]:
     """Return all tables for which there are results."""
-    return [
-        t for t in (_hacking(p), _noise(p), _kick(p), _bonuses(p), _ablation(p), _rating(p), _distortion(p)) if t.rows
-    ]
+    makers = (_hacking, _pooled, _noise, _kick, _bonuses, _ablation, _rating, _distortion)
+    return [t for make in makers if (t := make(p)).rows]
 
 
 def _steps(p: Published, study: str) -> str:
@@ -98,6 +97,45 @@ def _shares(p: Published, r: Row) -> tuple[str, str]:
     return removed, kept
 
 
+def pooled(p: Published, robot: str, agent: str, mitigation: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return ``shares`` of a mitigation over all of a robot's settings that lie: one pair of numbers per seed, (seeds,).
+
+    A seed's hacks and returns are added up over both regions and both panels before they are compared, so that one
+    lucky run decides less. None if a row is missing.
+    """
+    groups = [
+        [r for r in p.rows(HACKING, robot=robot, agent=agent, mitigation=m) if r["region"] != "none"]
+        for m in (mitigation, *REFERENCES)
+    ]
+    if [len(g) for g in groups] != [4, 2, 2]:
+        return None
+    ours, raw, honest = (
+        np.array([[p.per_seed(r, m) for m in ("trap_visits", "true_return")] for r in g]).mean(0) for g in groups
+    )
+    return 1.0 - ours[0] / raw[0], ours[1] / honest[1]
+
+
+def _settings(p: Published) -> list[tuple[str, str]]:
+    return list(dict.fromkeys((r["robot"], r["agent"]) for r in p.rows(HACKING)))
+
+
+def _pooled(p: Published) -> Table:
+    rows = []
+    for robot, agent in _settings(p):
+        for mitigation in ("uard-paper", "uard"):
+            if (found := pooled(p, robot, agent, mitigation)) is not None:
+                shares = (full(statistics.summarise(100 * x)) for x in found)
+                rows.append((robot, agent, mitigation, str(len(found[0])), *shares))
+    return Table(
+        "The same, both regions and both panels together",
+        ("robot", "agent", "learns from", "seeds", "hacks removed, %", "true return kept, %"),
+        tuple(rows),
+        3,
+        "A seed's hacks and returns are added up over the four settings, and compared with the raw agent's hacks and with "
+        "the true return of the agent trained on the true reward, of the same seed; then the seeds are summarised.",
+    )
+
+
 def _noise(p: Published) -> Table:
     rows = [
         (r["agent"], r["mitigation"], f"{100 * r['noise']:.0f} %", *(full(p.of(r, m)) for m in METRICS))
@@ -142,13 +180,17 @@ def _bonuses(p: Published) -> Table:
 
 
 def _ablation(p: Published) -> Table:
-    rows = [(r["region"], r["variant"], r["panel"], *(full(p.of(r, m)) for m in METRICS)) for r in p.rows(ABLATION)]
+    rows = [
+        (r["agent"], r["region"], r["variant"], r["panel"], *(full(p.of(r, m)) for m in METRICS))
+        for r in p.rows(ABLATION)
+    ]
     return Table(
-        f"Which source does the work (H8): Hopper, PPO with uard, {_steps(p, ABLATION)}",
-        ("region", "doubt", "panel", *HEADS),
+        f"Which source does the work (H8): Hopper, uard, {_steps(p, ABLATION)}",
+        ("agent", "region", "doubt", "panel", *HEADS),
         tuple(rows),
-        3,
-        "Only: the other is left out of U (alpha or beta = 0). lambda_t, which listens to the raters, stays in all three.",
+        4,
+        "Only: the other is left out of U (alpha or beta = 0). lambda_t, which listens to the raters, stays in all three. "
+        "Reward and score: the actor also climbs the anchored score of its critics.",
     )
 
 
@@ -228,11 +270,17 @@ def _of_hacking(p: Published) -> list[str]:
     leaks = [f"{_name(r)} {100 * x:.1f} %" for r, x, _ in lies if x is not None and x < REMOVED]
     poor = [f"{_name(r)} {100 * x:.0f} %" for r, _, x in lies if x is not None and x < KEPT]
     judged = sum(x is not None for _, x, _ in lies)
+    together = [
+        f"{robot} {agent} {full(statistics.summarise(100 * found[1]))} %"
+        for robot, agent in _settings(p)
+        if (found := pooled(p, robot, agent, "uard")) is not None
+    ]
     out.append(
         f"MuJoCo, {_steps(p, HACKING)}: of {judged} settings in which the raw agent hacks, uard removes less than "
         f"93.6 % of its hacks in {len(leaks)}{_listed(leaks)}; of {len(lies)} settings it keeps less than 90 % of the true "
         f"return of the agent trained on the true reward in {len(poor)}{_listed(poor)}. "
-        f"With {p.seeds(HACKING)} seeds these shares are rough: see the intervals."
+        f"With {p.seeds(HACKING)} seeds these shares are rough: see the intervals. All settings of a robot together, uard "
+        f"keeps: {'; '.join(together) or 'not all were run'}."
     )
     tame = [
         f"{r['robot']} {r['region']} {r['agent']}"

@@ -104,9 +104,9 @@ def bonuses(scale: Scale) -> tuple[Row, ...]:
 def noise(scale: Scale) -> tuple[Row, ...]:
     """Violations against rater noise of 0, 10, 20 and 30 % of the bonus (G11), Hopper, vibration.
 
-    Every agent by itself, PPO and SAC with ``uard``, PPO also with what else listens to raters.
+    PPO and SAC by themselves, which hear nothing of it, and with ``uard``; PPO also with what else listens to raters.
     """
-    heard = {"ppo": ("uard", *RIVALS), "sac": ("uard",)}
+    heard = {"ppo": ("raw", "uard", *RIVALS), "sac": ("raw", "uard")}
     return tuple(
         row(
             _cell(Locomotion(), named(mitigation), agent, steps, noise=share * NOISE_UNIT),
@@ -115,7 +115,7 @@ def noise(scale: Scale) -> tuple[Row, ...]:
             noise=share,
         )
         for name, (agent, steps) in scale.agents.items()
-        for mitigation in ("raw", *heard.get(name, ()))
+        for mitigation in heard.get(name, ())
         for share in (0.0, 0.1, 0.2, 0.3)
     )
 
@@ -139,18 +139,23 @@ def kick(scale: Scale) -> tuple[Row, ...]:
 
 
 def ablation(scale: Scale) -> tuple[Row, ...]:
-    """H8 in its continuous form: which source does the work."""
-    agent, steps = scale.agents["ppo"]
-    variants = {"both": {}, "sigma_h only": {"alpha": 0.0}, "sigma_m only": {"beta": 0.0}}
+    """H8 in its continuous form: which source does the work; and what a SAC gains whose actor climbs the score, too."""
+    both: dict[str, Any] = {"both sources": {}}
+    variants = {
+        "ppo": both | {"sigma_h only": {"alpha": 0.0}, "sigma_m only": {"beta": 0.0}},
+        "sac": both | {"both sources, reward and score": {"acts_on": "both"}},
+    }
     return tuple(
         row(
-            _cell(Locomotion(region=region()), named("uard", **changes), agent, steps, panel=panel),
+            _cell(Locomotion(region=region()), named("uard", **changes), *scale.agents[name], panel=panel),
+            agent=name,
             region=which,
             variant=variant,
             panel=panel,
         )
+        for name, several in variants.items()
         for which, region in REGIONS.items()
-        for variant, changes in variants.items()
+        for variant, changes in several.items()
         for panel in PANELS
     )
 
