@@ -101,13 +101,13 @@ def pooled(p: Published, robot: str, agent: str, mitigation: str) -> tuple[np.nd
     """Return ``shares`` of a mitigation over all of a robot's settings that lie: one pair of numbers per seed, (seeds,).
 
     A seed's hacks and returns are added up over both regions and both panels before they are compared, so that one
-    lucky run decides less. None if a row is missing.
+    lucky run decides less. None if a row is missing, or has other seeds than the rest.
     """
     groups = [
         [r for r in p.rows(HACKING, robot=robot, agent=agent, mitigation=m) if r["region"] != "none"]
         for m in (mitigation, *REFERENCES)
     ]
-    if [len(g) for g in groups] != [4, 2, 2]:
+    if [len(g) for g in groups] != [4, 2, 2] or len({p.seeds_of(r) for g in groups for r in g}) > 1:
         return None
     ours, raw, honest = (
         np.array([[p.per_seed(r, m) for m in ("trap_visits", "true_return")] for r in g]).mean(0) for g in groups

@@ -154,9 +154,13 @@ class Published:
         """Return the published rows of a study with these labels."""
         return [r for r in self.studies[study].where(**labels) if self.has(r)]
 
+    def seeds_of(self, row: Row) -> tuple[int, ...]:
+        """Return the seeds of a row."""
+        return tuple(self._cells[row.cell.key]["seeds"])
+
     def seeds(self, study: str) -> int:
         """Return the smallest number of seeds of a published row."""
-        return min((len(self._cells[r.cell.key]["seeds"]) for r in self.rows(study)), default=0)
+        return min((len(self.seeds_of(r)) for r in self.rows(study)), default=0)
 
     def of(self, row: Row, metric: str) -> Summary:
         """Return a metric's summary."""

@@ -57,7 +57,7 @@ class Scale:
 
 ALL = tuple(name for name in continuous_agents() if name != "cpo-oracle")
 SMOKE = Scale("smoke", 4_096, 2_560, True, ("ppo", "sac"), ("hopper",))
-STANDARD = Scale("standard", 200_000, 100_000, True, ALL)
+STANDARD = Scale("standard", 200_000, 50_000, True, ALL)
 PAPER = Scale("paper", 1_000_000, 1_000_000, False, ALL)
 
 
@@ -96,7 +96,7 @@ def bonuses(scale: Scale) -> tuple[Row, ...]:
         )
         for which, region in REGIONS.items()
         for bonus in (4.0, 6.0, 8.0)
-        for mitigation in ("raw", "uard-operator", "worst-of-annotations", "uard")
+        for mitigation in ("raw", "uard-operator", "uard")
         for panel in (PANELS if named(mitigation).reads_feedback else PANELS[:1])
     )
 
