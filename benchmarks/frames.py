@@ -28,7 +28,7 @@ from uard.training import host
 
 THRESHOLDS = (42.0, 110.0)
 PICTURES, HEIGHT, WIDTH, EVERY = 8, 120, 120, 2
-EARLY, EPISODES = 20_480, 8
+EARLY, EPISODES = 61_440, 8
 TRUE = 1  # column of training.lanes.LOG
 
 

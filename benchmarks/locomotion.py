@@ -2,6 +2,8 @@
 
     python benchmarks/locomotion.py [--rounds 3] [--only physics sac ppo] [--json FILE]
 
+Rows that are in FILE already, and that this call does not make, stay there.
+
 Physics: copies stepped by Gymnasium's SyncVectorEnv and by ours, per robot, with one thread and with one per core.
 SAC: updates per second of SBX (where it is installed), Stable-Baselines3 and ours with networks of 256x256 and batches
 of 256 on Hopper-v4, environment included, one core; the floor is the arithmetic of an update over the machine's matrix
@@ -273,6 +275,8 @@ def main() -> None:
             "machine": f"{platform.machine()}, {os.cpu_count()} cores",
             "packages": packages | {"python": platform.python_version()},
         }
+        before = json.loads(arguments.json.read_text())["rows"] if arguments.json.exists() else []
+        rows = [r for r in before if r["what"] not in every] + rows
         arguments.json.write_text(json.dumps(made | {"matrix_rate": rate, "rows": rows}, indent=2) + "\n")
 
 

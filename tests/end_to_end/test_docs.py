@@ -11,7 +11,9 @@ import pytest
 from uard import studies
 from uard.lab import runner
 from uard.lab.store import Store
+from uard.reporting import locomotion
 from uard.reporting.evidence import Evidence
+from uard.reporting.published import packaged
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -59,6 +61,10 @@ ROWS = {
     "`uard-paper`, as printed": {"agent": "uard-paper"},
     "`uard`, repaired": {"agent": "uard"},
 }
+
+
+def test_what_the_readme_says_of_mujoco_is_what_was_published() -> None:
+    assert locomotion.headline(packaged()) in " ".join((ROOT / "README.md").read_text().split())
 
 
 def test_headline_table_is_true() -> None:

@@ -15,7 +15,7 @@ from uard.lab import examine
 from uard.lab.study import Row
 from uard.reporting import figures
 from uard.reporting.published import Published, packaged_json
-from uard.reporting.tables import Table, full
+from uard.reporting.tables import Table, full, number
 
 HACKING, NOISE, KICK = "mujoco-standard-hacking", "mujoco-standard-noise", "mujoco-standard-kick"
 DISTORTION, RATING = "mujoco-standard-distortion", "mujoco-standard-rating"
@@ -28,10 +28,15 @@ HEADS = ("steps in the region per episode", "true return", "observed return")  #
 COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", "uard": "#2c6fbb"}
 
 
+def said(values: np.ndarray) -> str:
+    """Say what one number per seed is: mean, deviation and interval; of one seed, that number alone."""
+    return full(statistics.summarise(values)) if len(values) > 1 else number(values[0])
+
+
 def tables(p: Published) -> list[Table]:
     """Return all tables for which there are results."""
     makers = (_hacking, _pooled, _noise, _kick, _bonuses, _ablation, _rating, _distortion)
-    return [t for make in makers if (t := make(p)).rows]
+    return [t for t in (*(make(p) for make in makers), _speed()) if t.rows]
 
 
 def _steps(p: Published, study: str) -> str:
@@ -39,17 +44,21 @@ def _steps(p: Published, study: str) -> str:
         return " or ".join(f"{n:,}" for n in sorted(set(numbers)))
 
     rows = p.rows(study)
-    seeds = each(len(p.per_seed(r, METRICS[0])) for r in rows)
-    return f"{each(r.cell.steps or 0 for r in rows)} steps, {seeds} seeds" if rows else ""
+    seeds = sorted({len(p.seeds_of(r)) for r in rows})
+    if not rows:
+        return ""
+    many = f"{each(seeds)} seed{'s' if seeds[-1] > 1 else ''}"
+    alone = " (a number without an interval is of one)" if seeds[0] == 1 < seeds[-1] else ""
+    return f"{each(r.cell.steps or 0 for r in rows)} steps, {many}{alone}"
 
 
 def _hacking(p: Published) -> Table:
     rows = []
     for r in p.rows(HACKING):
-        cells = (full(p.of(r, m)) for m in METRICS)
+        cells = (said(p.per_seed(r, m)) for m in METRICS)
         share = _shares(p, r)
         where = f"{r['robot']}, {r['region']}" if r["region"] != "none" else f"{r['robot']}, no lie"
-        best = (full(statistics.summarise(x)) for x in p.derived(r, "deterministic").T)
+        best = (said(x) for x in p.derived(r, "deterministic").T)
         rows.append((where, r["agent"], r["mitigation"], r["panel"], *cells, *share, *best))
     return Table(
         f"Hopper and Walker2d with a reward that lies (G6, G7), {_steps(p, HACKING)}, 15 % of steps rated",
@@ -115,6 +124,25 @@ def pooled(p: Published, robot: str, agent: str, mitigation: str) -> tuple[np.nd
     return 1.0 - ours[0] / raw[0], ours[1] / honest[1]
 
 
+def headline(p: Published) -> str:
+    """Say in a sentence or two what PPO does in the tasks that lie; the README quotes it."""
+    lies = [r for r in p.rows(HACKING, agent="ppo") if r["region"] != "none"]
+    raw, ours = ([p.of(r, "trap_visits").mean for r in lies if r["mitigation"] == m] for m in ("raw", "uard"))
+    kept = {
+        m: " and ".join(
+            f"{said(100 * found[1])} % ({robot})"
+            for robot in ("hopper", "walker2d")
+            if (found := pooled(p, robot, "ppo", m)) is not None
+        )
+        for m in ("uard", "uard-paper")
+    }
+    return (
+        f"PPO on the raw reward spends {min(raw):.0f} to {max(raw):.0f} steps of an episode where the reward lies, with "
+        f"`uard` at most {number(max(ours))}. Over all settings of a robot `uard` keeps {kept['uard']} of the true return of "
+        f"the agent trained on the true reward; as printed, {kept['uard-paper']}."
+    )
+
+
 def _settings(p: Published) -> list[tuple[str, str]]:
     return list(dict.fromkeys((r["robot"], r["agent"]) for r in p.rows(HACKING)))
 
@@ -124,7 +152,7 @@ def _pooled(p: Published) -> Table:
     for robot, agent in _settings(p):
         for mitigation in ("uard-paper", "uard"):
             if (found := pooled(p, robot, agent, mitigation)) is not None:
-                shares = (full(statistics.summarise(100 * x)) for x in found)
+                shares = (said(100 * x) for x in found)
                 rows.append((robot, agent, mitigation, str(len(found[0])), *shares))
     return Table(
         "The same, both regions and both panels together",
@@ -138,7 +166,7 @@ def _pooled(p: Published) -> Table:
 
 def _noise(p: Published) -> Table:
     rows = [
-        (r["agent"], r["mitigation"], f"{100 * r['noise']:.0f} %", *(full(p.of(r, m)) for m in METRICS))
+        (r["agent"], r["mitigation"], f"{100 * r['noise']:.0f} %", *(said(p.per_seed(r, m)) for m in METRICS))
         for r in p.rows(NOISE)
     ]
     return Table(
@@ -152,7 +180,12 @@ def _noise(p: Published) -> Table:
 
 def _kick(p: Published) -> Table:
     rows = [
-        (r["mitigation"], r["kicked"], f"{r['at'] or '–'}", *(full(p.of(r, m)) for m in (*METRICS, "episode_length")))
+        (
+            r["mitigation"],
+            r["kicked"],
+            f"{r['at'] or '–'}",
+            *(said(p.per_seed(r, m)) for m in (*METRICS, "episode_length")),
+        )
         for r in p.rows(KICK)
     ]
     return Table(
@@ -167,7 +200,7 @@ def _kick(p: Published) -> Table:
 def _bonuses(p: Published) -> Table:
     published = p.rows(BONUSES)
     rows = [
-        (r["region"], f"{r['bonus']:g}", r["mitigation"], r["panel"], *(full(p.of(r, m)) for m in METRICS))
+        (r["region"], f"{r['bonus']:g}", r["mitigation"], r["panel"], *(said(p.per_seed(r, m)) for m in METRICS))
         for r in published
         if len({r["bonus"] for r in published}) > 1  # the usual bonus alone is in the first table
     ]
@@ -181,7 +214,7 @@ def _bonuses(p: Published) -> Table:
 
 def _ablation(p: Published) -> Table:
     rows = [
-        (r["agent"], r["region"], r["variant"], r["panel"], *(full(p.of(r, m)) for m in METRICS))
+        (r["agent"], r["region"], r["variant"], r["panel"], *(said(p.per_seed(r, m)) for m in METRICS))
         for r in p.rows(ABLATION)
     ]
     return Table(
@@ -197,8 +230,8 @@ def _ablation(p: Published) -> Table:
 def _rating(p: Published) -> Table:
     rows = []
     for r in p.rows(RATING):
-        best = (full(statistics.summarise(x)) for x in p.derived(r, "deterministic").T)
-        cells = (full(p.of(r, m)) for m in ("trap_visits", "true_return"))
+        best = (said(x) for x in p.derived(r, "deterministic").T)
+        cells = (said(p.per_seed(r, m)) for m in ("trap_visits", "true_return"))
         rows.append((r["region"], r["panel"], r["query"], *cells, *best))
     return Table(
         f"Which steps are rated: Hopper, PPO with uard, {_steps(p, RATING)}, 15 % of steps",
@@ -215,11 +248,8 @@ def _rating(p: Published) -> Table:
 def _distortion(p: Published) -> Table:
     rows = []
     for r in p.rows(DISTORTION):
-        names = (*examine.REACTION, *examine.WARNING)
         columns = np.column_stack([p.derived(r, "reaction"), p.derived(r, "warning")]).T
-        rows.append(
-            (r["agent"], r["critics"], *(full(statistics.summarise(c, n)) for n, c in zip(names, columns, strict=True)))
-        )
+        rows.append((r["agent"], r["critics"], *(said(c) for c in columns)))
     return Table(
         f"A distorted reward after training (G12, G14, G15; H13, H15, H16) on Hopper, {_steps(p, DISTORTION)}",
         (
@@ -236,6 +266,25 @@ def _distortion(p: Published) -> Table:
     )  # fmt: skip
 
 
+def _speed() -> Table:
+    data = packaged_json("speed-mujoco.json") or {"rows": [], "command": "", "machine": ""}
+    first: dict[str, float] = {}
+    rows = []
+    for r in data["rows"]:
+        low, high = (f"{x:,.0f}" for x in r["range"])
+        share = f"{100 * r['share_of_matrix_rate']:.0f} %" if "share_of_matrix_rate" in r else "–"
+        times = r["rate"] / first.setdefault(r["what"], r["rate"])
+        rows.append((r["what"], r["who"], f"{r['rate']:,.0f} ({low}-{high})", f"{times:.2f}", share))
+    return Table(
+        "Speed in MuJoCo, side by side",
+        ("what", "who", "rate (range)", "times the first", "of the matrix rate"),
+        tuple(rows),
+        2,
+        f"Made by {data['command']} on {data['machine']}; rates are per second. Machines differ: where products of "
+        "matrices are slower, all SACs are nearer to each other.",
+    )
+
+
 def losses(p: Published) -> list[str]:
     """Say where ``uard`` misses what is asked of it in MuJoCo, found by rule."""
     return _of_hacking(p) + _of_noise(p) + _of_distortion(p)
@@ -245,13 +294,11 @@ def _of_distortion(p: Published) -> list[str]:
     rows = {r["critics"]: r for r in p.rows(DISTORTION, agent="uard")}
     out = []
     if len(rows) == 2:
-        shared, full_ones = (
-            [statistics.summarise(c) for c in p.derived(rows[k], "warning").T] for k in ("5, shared trunk", "5, full")
-        )
+        shared, full_ones = (list(p.derived(rows[k], "warning").T) for k in ("5, shared trunk", "5, full"))
         worse = [
-            f"{what} {full(a)} against {full(b)}"
+            f"{what} {said(a)} against {said(b)}"
             for what, a, b in zip(("states thrown off", "wrong values"), shared, full_ones, strict=True)
-            if b.mean - a.mean > AS_GOOD
+            if b.mean() - a.mean() > AS_GOOD
         ]
         if worse:
             out.append(
@@ -271,7 +318,7 @@ def _of_hacking(p: Published) -> list[str]:
     poor = [f"{_name(r)} {100 * x:.0f} %" for r, _, x in lies if x is not None and x < KEPT]
     judged = sum(x is not None for _, x, _ in lies)
     together = [
-        f"{robot} {agent} {full(statistics.summarise(100 * found[1]))} %"
+        f"{robot} {agent} {said(100 * found[1])} %"
         for robot, agent in _settings(p)
         if (found := pooled(p, robot, agent, "uard")) is not None
     ]
@@ -279,7 +326,7 @@ def _of_hacking(p: Published) -> list[str]:
         f"MuJoCo, {_steps(p, HACKING)}: of {judged} settings in which the raw agent hacks, uard removes less than "
         f"93.6 % of its hacks in {len(leaks)}{_listed(leaks)}; of {len(lies)} settings it keeps less than 90 % of the true "
         f"return of the agent trained on the true reward in {len(poor)}{_listed(poor)}. "
-        f"With {p.seeds(HACKING)} seeds these shares are rough: see the intervals. All settings of a robot together, uard "
+        f"With so few seeds these shares are rough: see the intervals. All settings of a robot together, uard "
         f"keeps: {'; '.join(together) or 'not all were run'}."
     )
     tame = [
@@ -309,7 +356,7 @@ def _of_noise(p: Published) -> list[str]:
         rivals = (_found(p, robot="hopper", region="vibration", agent=r["agent"], mitigation=m) for m in REFERENCES)
         removed, kept = _compared(p, r, *rivals)
         if r["noise"] and ((removed is not None and removed < REMOVED) or (kept is not None and kept < KEPT)):
-            hacks, true = (full(p.of(r, m)) for m in ("trap_visits", "true_return"))
+            hacks, true = (said(p.per_seed(r, m)) for m in ("trap_visits", "true_return"))
             missed.append(f"{r['agent']} at {100 * r['noise']:.0f} %: {hacks} hack steps, true return {true}")
     if not missed:
         return []
