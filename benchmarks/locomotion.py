@@ -270,13 +270,14 @@ def main() -> None:
     if arguments.json:
         wanted = ("uard", "jax", "mujoco", "gymnasium", "stable-baselines3", "torch", "sbx-rl")
         packages = {p: metadata.version(p) for p in wanted if p != "sbx-rl" or util.find_spec("sbx")}
-        made = {
+        made: dict[str, Any] = {
             "command": f"python benchmarks/locomotion.py --rounds {arguments.rounds}",
             "machine": f"{platform.machine()}, {os.cpu_count()} cores",
             "packages": packages | {"python": platform.python_version()},
         }
-        before = json.loads(arguments.json.read_text())["rows"] if arguments.json.exists() else []
-        rows = [r for r in before if r["what"] not in every] + rows
+        before = json.loads(arguments.json.read_text()) if arguments.json.exists() else {"rows": [], "packages": {}}
+        made["packages"] = before["packages"] | packages
+        rows = [r for r in before["rows"] if r["what"] not in every] + rows
         arguments.json.write_text(json.dumps(made | {"matrix_rate": rate, "rows": rows}, indent=2) + "\n")
 
 
