@@ -358,12 +358,26 @@ def _of_noise(p: Published) -> list[str]:
         if r["noise"] and ((removed is not None and removed < REMOVED) or (kept is not None and kept < KEPT)):
             hacks, true = (said(p.per_seed(r, m)) for m in ("trap_visits", "true_return"))
             missed.append(f"{r['agent']} at {100 * r['noise']:.0f} %: {hacks} hack steps, true return {true}")
-    if not missed:
-        return []
-    return [
-        f"MuJoCo, Hopper, vibration, noisy raters ({_steps(p, NOISE)}): uard removes less than 93.6 % of the hacks or "
-        f"keeps less than 90 % of the honest agent's true return: {'; '.join(missed)}."
-    ]
+    better = []
+    for r in p.rows(NOISE, mitigation="uard"):
+        own = p.of(r, "true_return").mean
+        rivals = [
+            x for x in p.rows(NOISE, agent=r["agent"], noise=r["noise"]) if x["mitigation"] not in ("uard", "raw")
+        ]
+        if over := [x for x in rivals if p.of(x, "true_return").mean > own]:
+            names = ", ".join(f"{x['mitigation']} {said(p.per_seed(x, 'true_return'))}" for x in over)
+            better.append(
+                f"{r['agent']} at {100 * r['noise']:.0f} %: {names} (uard {said(p.per_seed(r, 'true_return'))})"
+            )
+    out = []
+    if missed:
+        out.append(
+            f"MuJoCo, Hopper, vibration, noisy raters ({_steps(p, NOISE)}): uard removes less than 93.6 % of the hacks or "
+            f"keeps less than 90 % of the honest agent's true return: {'; '.join(missed)}."
+        )
+    if better:
+        out.append(f"MuJoCo, Hopper, vibration: others who listen have a higher true return: {'; '.join(better)}.")
+    return out
 
 
 def _listed(names: list[str]) -> str:
