@@ -313,7 +313,7 @@ def test_a_fresh_policy_is_almost_uniform(ensemble: Ensemble):
     state = jax.jit(lambda key: learner.init(key, FEATURES, ACTIONS))(KEY)
     some = jnp.asarray(batch(1).observation)
     assert learner.values(state, some).shape == (ensemble.members, 4, ACTIONS)
-    assert entropy(log_policy(state.trained.actor, some)).min() > 0.95 * np.log(ACTIONS)
+    assert entropy(log_policy(learner.network, state.trained.actor, some)).min() > 0.95 * np.log(ACTIONS)
     jax.tree.map(np.testing.assert_array_equal, state.target, state.trained.critics)
     np.testing.assert_allclose(np.exp(state.trained.log_temperature), 0.3, rtol=1e-5)
     if ensemble == Ensemble("full", 3, 0.5):

@@ -287,7 +287,7 @@ def _credentials() -> Table:
     rows = []
     for row in data["rows"]:
         if "returns" in row:
-            who = {"ours": "ours", "theirs": LIBRARIES[row.get("library", "stable-baselines3")]}[row["who"]]
+            who = "ours" if row["who"] == "ours" else LIBRARIES[row.get("library", "stable-baselines3")]
             seeds, said = str(len(row["returns"])), full(statistics.summarise(row["returns"]))
         else:
             who, seeds, said = row["who"], "–", f"{row['mean']} ± {row['sd']}"
