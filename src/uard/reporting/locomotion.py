@@ -475,5 +475,5 @@ def _dots(p: Published, settings: list[Any]) -> Figure:
     for name, colour in COLOURS.items():
         axes[0].plot([], [], "o", color=colour, label=name)
     axes[0].plot([], [], "o", color="#777777", mfc="none", label="appendix panel")
-    axes[0].legend(fontsize=8, loc="upper right")
+    axes[0].legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5)  # above: it hides no dot
     return figure
