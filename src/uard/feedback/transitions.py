@@ -6,6 +6,9 @@ rater said, and how far apart they were, on (s, a, s', observed reward). sigma_h
 predicted ratings and the reward that was observed, which tells hacks apart far better than a predicted spread. The
 lowest rating is that of the rater who is predicted to say least: what the lowest of several noisy ratings is on average
 sinks with the noise, and an agent that can end its episode then prefers to fall.
+
+Noise also makes predictions err, so that raters seem to differ, and steps to be disputed, where nothing is. Only that
+part of a difference counts that is more than the members' deviation (``beyond``).
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ import optax
 from jax import Array, lax
 
 from uard import _checks
-from uard.mitigation import Feedback, Mitigation
+from uard.mitigation import Feedback, Mitigation, Usual
 from uard.networks import Layer, descend, mlp, through
 
 QUERIES = ("random", "doubtful")  # which steps are rated
@@ -159,6 +162,11 @@ def _normal(model: Model, inputs: Array) -> Array:
     return jnp.clip((inputs - model.centre) / model.width, -5.0, 5.0)
 
 
+def beyond(difference: Array, deviation: Array) -> Array:
+    """Return a difference less its deviation, 0 where it is not larger: soft thresholding [Donoho 1995]."""
+    return jnp.sign(difference) * jnp.maximum(jnp.abs(difference) - deviation, 0.0)
+
+
 def read(spec: TransitionModel, model: Model, inputs: Array, raters: int) -> Feedback:
     """Predict the feedback of steps (B, width); ``proxy`` is the reward that was observed.
 
@@ -169,9 +177,16 @@ def read(spec: TransitionModel, model: Model, inputs: Array, raters: int) -> Fee
     before = spec.prior_scale**2 * through(model.prior, x).var(0, ddof=1).mean(-1)
     after = out.var(0, ddof=1).mean(-1)
     count = jnp.maximum(before / jnp.maximum(after, 1e-6) - 1.0, 0.0)
-    said = model.location + model.scale * out.mean(0)
-    ratings, spread = said[:, :-1], jnp.maximum(said[:, -1], 0.0)
-    return Feedback(count, ratings.mean(1), ratings.min(1), spread, inputs[:, -1], jnp.asarray(raters, jnp.float32))
+    said = model.location + model.scale * out
+    ratings = said[..., :-1]
+    means = ratings.mean(-1, keepdims=True)
+    apart = ratings - means
+    typical = model.location[-1]
+    unusual = said[..., -1] - typical
+    mean = means.mean((0, 2))
+    lowest = mean + beyond(apart.mean(0), apart.std(0, ddof=1)).min(-1)
+    spread = jnp.maximum(typical + beyond(unusual.mean(0), unusual.std(0, ddof=1)), 0.0)
+    return Feedback(count, mean, lowest, spread, inputs[:, -1], jnp.asarray(raters, jnp.float32))
 
 
 @partial(jax.jit, static_argnames="spec")
@@ -192,6 +207,15 @@ def usual(mitigation: Mitigation, spec: TransitionModel, model: Any, kept: Array
         return mitigation.usual(nothing(1, raters), jnp.zeros(1, bool))
     feedback = read(spec, model, kept, raters)
     return mitigation.usual(feedback, (jnp.arange(kept.shape[0]) < seen) & (feedback.count > 0))
+
+
+def expecting(usual: Any, feedback: Feedback) -> Any:
+    """Return what is usual, with what each step is predicted to be worth at least in the place of what all are.
+
+    Anchors of few ratings are drawn towards the latter. A prediction is a regression's: it has been drawn already, and
+    once more would make all steps, good and bad, look alike.
+    """
+    return usual._replace(lowest=feedback.lowest) if isinstance(usual, Usual) else usual
 
 
 @partial(jax.jit, static_argnames="spec")

@@ -154,10 +154,13 @@ class _Judge:
 
     def __call__(self, steps: Walked, reward: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what the agent and a static pessimist would learn from steps so rewarded, and lambda_t; (B,) each."""
+        from uard.feedback import transitions
+
         agent, mitigation, moved = self.job.agent, self.job.mitigation, steps.moved
         ahead = np.where(moved.terminated, 0.0, agent.gamma * self.doubt(moved.observation))
         evidence = Evidence(reward, ahead, self._feedback(steps, reward))
-        adjusted = np.asarray(mitigation.signal(evidence, self.usual[mitigation]).reward, float)
+        usual = {m: transitions.expecting(u, evidence.feedback) for m, u in self.usual.items()}
+        adjusted = np.asarray(mitigation.signal(evidence, usual[mitigation]).reward, float)
         opinions = self.opinions(steps.observation)
         if heat := getattr(agent, "backup_temperature", 0.0):
             adjusted = adjusted * backup_trust(opinions.std(0, ddof=1), heat)
@@ -165,9 +168,9 @@ class _Judge:
             adjusted = adjusted - (opinions.mean(0) - opinions.min(0))
         caution, lam = reward, np.zeros(len(reward))
         if self.job.listens:
-            caution = np.asarray(CAUTION.signal(evidence, self.usual[CAUTION]).reward)
+            caution = np.asarray(CAUTION.signal(evidence, usual[CAUTION]).reward)
         if isinstance(mitigation, RewardDiscounting):
-            lam = lam + np.asarray(mitigation.explain(evidence, self.usual[mitigation]).lam)
+            lam = lam + np.asarray(mitigation.explain(evidence, usual[mitigation]).lam)
         return adjusted, caution, lam
 
     def _feedback(self, steps: Walked, reward: np.ndarray) -> Feedback:

@@ -185,11 +185,13 @@ def _learn(
             feedback = transitions.nothing(agent.batch, raters)
         alone = as_column(feedback)
 
+        expected = transitions.expecting(usual, feedback)
+
         def judge(sigma: Array) -> Any:
-            return mitigation.signal(Evidence(drawn.reward, sigma, feedback), usual)
+            return mitigation.signal(Evidence(drawn.reward, sigma, feedback), expected)
 
         def prefer(mu: Array, sigma: Array) -> Array:
-            return mitigation.score(mu[:, None], sigma[:, None], alone, usual)[:, 0]
+            return mitigation.score(mu[:, None], sigma[:, None], alone, expected)[:, 0]
 
         mask = (jax.random.uniform(mask_key, (agent.batch, agent.members)) < agent.bootstrap).astype(jnp.float32)
         batch = Batch(drawn.observation, drawn.action, drawn.following, drawn.terminated, mask)

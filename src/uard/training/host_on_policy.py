@@ -155,6 +155,7 @@ def _learn(
         feedback = transitions.read(model_spec, model, flat(told), raters)
     else:
         feedback = transitions.nothing(total, raters)
+    usual = transitions.expecting(usual, feedback)
     signal = mitigation.signal(Evidence(flat(reward), ahead, feedback), usual)
     alone = as_column(feedback)
 
