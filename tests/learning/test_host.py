@@ -242,8 +242,10 @@ def test_raters_who_are_all_noisy_are_still_known_and_the_lowest_of_them_does_no
 
 
 def test_a_difference_counts_as_far_as_it_is_more_than_its_deviation():
-    beyond = transitions.beyond(jax.numpy.array([-3.0, -0.5, 0.0, 0.5, 3.0]), jax.numpy.float32(1.0))
-    np.testing.assert_array_equal(beyond, [-2.0, 0.0, 0.0, 0.0, 2.0])
+    means = jax.numpy.array([-3.0, -0.5, 0.0, 0.5, 3.0])
+    members = jax.numpy.stack([means - 1.0, means, means + 1.0])
+    np.testing.assert_allclose(transitions.beyond(members, 1.0), [-2.0, 0.0, 0.0, 0.0, 2.0], rtol=1e-6)
+    np.testing.assert_allclose(transitions.beyond(members, 0.0), means, rtol=1e-6)
 
 
 def test_the_anchor_of_a_predicted_step_is_the_prediction_however_little_it_is_worth():

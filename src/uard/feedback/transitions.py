@@ -8,7 +8,7 @@ lowest rating is that of the rater who is predicted to say least: what the lowes
 sinks with the noise, and an agent that can end its episode then prefers to fall.
 
 Noise also makes predictions err, so that raters seem to differ, and steps to be disputed, where nothing is. Only that
-part of a difference counts that is more than the members' deviation (``beyond``).
+part of a difference counts that is more than the members' own deviation (``beyond``).
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ class TransitionModel:
         prior_scale: Size of the fixed random functions, in units of the ratings' deviation, > 0. It says how much is
             unknown before anybody rates: where noise makes the members differ by as much, nothing counts as known.
         capacity: Rated steps kept.
+        deviations: Deviations of the members, >= 0, by which differences are reduced before they count; see ``beyond``.
     """
 
     members: int = 5
@@ -53,6 +54,7 @@ class TransitionModel:
     batch: int = 256
     prior_scale: float = 1.0
     capacity: int = 16_384
+    deviations: float = 1.0
 
     def __post_init__(self) -> None:
         """Check the parameters."""
@@ -63,6 +65,7 @@ class TransitionModel:
         _checks.whole("batch", self.batch, low=1, high=65_536)
         _checks.number("prior_scale", self.prior_scale, low=0, open_low=True)
         _checks.whole("capacity", self.capacity, low=self.batch, high=10_000_000)
+        _checks.number("deviations", self.deviations, low=0)
 
 
 class Reservoir(NamedTuple):
@@ -162,9 +165,13 @@ def _normal(model: Model, inputs: Array) -> Array:
     return jnp.clip((inputs - model.centre) / model.width, -5.0, 5.0)
 
 
-def beyond(difference: Array, deviation: Array) -> Array:
-    """Return a difference less its deviation, 0 where it is not larger: soft thresholding [Donoho 1995]."""
-    return jnp.sign(difference) * jnp.maximum(jnp.abs(difference) - deviation, 0.0)
+def beyond(differences: Array, deviations: float) -> Array:
+    """Return the mean over members (M, ...) less some of their deviations, 0 where it is not larger.
+
+    Soft thresholding [Donoho 1995] at how far the members are apart.
+    """
+    mean = differences.mean(0)
+    return jnp.sign(mean) * jnp.maximum(jnp.abs(mean) - deviations * differences.std(0, ddof=1), 0.0)
 
 
 def read(spec: TransitionModel, model: Model, inputs: Array, raters: int) -> Feedback:
@@ -180,12 +187,10 @@ def read(spec: TransitionModel, model: Model, inputs: Array, raters: int) -> Fee
     said = model.location + model.scale * out
     ratings = said[..., :-1]
     means = ratings.mean(-1, keepdims=True)
-    apart = ratings - means
-    typical = model.location[-1]
-    unusual = said[..., -1] - typical
     mean = means.mean((0, 2))
-    lowest = mean + beyond(apart.mean(0), apart.std(0, ddof=1)).min(-1)
-    spread = jnp.maximum(typical + beyond(unusual.mean(0), unusual.std(0, ddof=1)), 0.0)
+    lowest = mean + beyond(ratings - means, spec.deviations).min(-1)
+    typical = model.location[-1]
+    spread = jnp.maximum(typical + beyond(said[..., -1] - typical, spec.deviations), 0.0)
     return Feedback(count, mean, lowest, spread, inputs[:, -1], jnp.asarray(raters, jnp.float32))
 
 
