@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 
 import numpy as np
 import pytest
@@ -22,8 +23,8 @@ from uard.lab.store import Store
 from uard.lab.study import Study, row
 from uard.mitigation import named
 from uard.networks import Network
-from uard.reporting import distortion
-from uard.reporting.published import BIN, Published, extract, packaged
+from uard.reporting import distortion, published
+from uard.reporting.published import BIN, Published, checkout, extract, packaged
 
 SMALL = DeepQ(Network(hidden=8), batch=8, buffer=64, warmup=32, target_every=16)
 GRID = TrapGrid(size=4, traps=((1, 2),), horizon=12)
@@ -130,9 +131,28 @@ def test_published_results_come_back_and_stale_ones_do_not():
     assert back.curves(study.rows[0], "trap_visits").shape == (3, 20 // BIN)
     assert back.derived(study.rows[0], "rating_error").shape == (3, 5)
     assert back.sources[0]["command"] == "made so"
+    assert back.sources[0]["commit"] == checkout()
     with pytest.raises(LookupError, match="not published"):
         back.get("deep-baselines", "trap_visits", agent="b")
     assert Published((study,), [data | {"results": -1}]).rows("deep-baselines") == [], "another version's training"
+
+
+def test_the_checkout_is_named_only_where_the_code_belongs_to_it(tmp_path, monkeypatch):
+    def git(*words):
+        who = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+        return subprocess.run(["git", "-C", tmp_path, *who, *words], check=True, capture_output=True, text=True).stdout
+
+    code = tmp_path / "code.py"
+    code.write_text("1\n")
+    git("init", "-q")
+    monkeypatch.setattr(published, "__file__", str(code))
+    assert checkout() is None, "a repository around an installed package is not its own"
+    git("add", "code.py")
+    git("commit", "-qm", "code")
+    commit = git("rev-parse", "HEAD").strip()[:12]
+    assert checkout() == commit
+    code.write_text("2\n")
+    assert checkout() == f"{commit}-dirty"
 
 
 def test_what_is_packaged_belongs_to_the_present_definitions():

@@ -125,7 +125,7 @@ def pooled(p: Published, robot: str, agent: str, mitigation: str) -> tuple[np.nd
 
 
 def headline(p: Published) -> str:
-    """Say in a sentence or two what PPO does in the tasks that lie; the README quotes it."""
+    """Say in a few sentences what PPO does in the tasks that lie, also under noise; the README quotes it."""
     lies = [r for r in p.rows(HACKING, agent="ppo") if r["region"] != "none"]
     raw, ours = ([p.of(r, "trap_visits").mean for r in lies if r["mitigation"] == m] for m in ("raw", "uard"))
     kept = {
@@ -136,10 +136,15 @@ def headline(p: Published) -> str:
         )
         for m in ("uard", "uard-paper")
     }
+    noisy = p.studies[NOISE].one(agent="ppo", mitigation="uard", noise=0.3)
+    honest = p.studies[HACKING].one(robot="hopper", region="vibration", agent="ppo", mitigation="true reward")
     return (
         f"PPO on the raw reward spends {min(raw):.0f} to {max(raw):.0f} steps of an episode where the reward lies, with "
         f"`uard` at most {number(max(ours))}. Over all settings of a robot `uard` keeps {kept['uard']} of the true return of "
-        f"the agent trained on the true reward; as printed, {kept['uard-paper']}."
+        f"the agent trained on the true reward; as printed, {kept['uard-paper']}. "
+        f"With noise of 30 % of the bonus on every rating (Hopper, vibration) it spends "
+        f"{said(p.per_seed(noisy, 'trap_visits'))} steps where the reward lies and has a true return of "
+        f"{said(p.per_seed(noisy, 'true_return'))}; the honest agent has {said(p.per_seed(honest, 'true_return'))}."
     )
 
 
@@ -314,7 +319,7 @@ def _of_hacking(p: Published) -> list[str]:
         return []
     out = []
     lies = [(r, *shares(p, r)) for r in ours if r["region"] != "none"]
-    leaks = [f"{_name(r)} {100 * x:.1f} %" for r, x, _ in lies if x is not None and x < REMOVED]
+    leaks = [f"{_name(r)} {100 * x:.1f} %, {_steps_inside(p, r)}" for r, x, _ in lies if x is not None and x < REMOVED]
     poor = [f"{_name(r)} {100 * x:.0f} %" for r, _, x in lies if x is not None and x < KEPT]
     judged = sum(x is not None for _, x, _ in lies)
     together = [
@@ -348,6 +353,12 @@ def _of_hacking(p: Published) -> list[str]:
             f"settings{_listed(dear)}."
         )
     return out
+
+
+def _steps_inside(p: Published, r: Row) -> str:
+    rows = (r, _rival(p, r, "raw"), _rival(p, r, "true reward"))
+    own, raw, honest = ("?" if x is None else number(p.of(x, "trap_visits").mean) for x in rows)
+    return f"{own} steps of {raw} where training on the true reward leaves {honest}"
 
 
 def _of_noise(p: Published) -> list[str]:

@@ -11,9 +11,12 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shutil
+import subprocess
 from collections.abc import Sequence
 from functools import cache
 from importlib import metadata, resources
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -54,11 +57,24 @@ def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], comman
     return {
         "command": command,
         "version": __version__,
+        "commit": checkout(),
         "results": RESULTS,
         "packages": {p: metadata.version(p) for p in packages} | {"python": platform.python_version()},
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "cells": cells,
     }
+
+
+def checkout() -> str | None:
+    """Return the commit of the checkout that this code stands in, and whether it was changed; None if it is in none."""
+    here = Path(__file__)
+
+    def git(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(["git", "-C", str(here.parent), *words], capture_output=True, text=True, check=False)
+
+    if shutil.which("git") is None or git("ls-files", "--error-unmatch", here.name).returncode:
+        return None
+    return git("describe", "--always", "--dirty", "--abbrev=12", "--exclude=*").stdout.strip()
 
 
 def _of_cell(studies: set[str], cell: Cell, found: dict[int, Result]) -> dict[str, Any]:
