@@ -20,6 +20,7 @@ from uard.reporting.tables import Table, full, number
 HACKING, NOISE, KICK = "mujoco-standard-hacking", "mujoco-standard-noise", "mujoco-standard-kick"
 DISTORTION, RATING = "mujoco-standard-distortion", "mujoco-standard-rating"
 BONUSES, ABLATION = "mujoco-standard-bonuses", "mujoco-standard-ablation"
+LEGITIMATE = "mujoco-standard-legitimate"
 AS_GOOD = 0.03  # by how much the AUROC of a cheaper sigma_m may be lower
 REFERENCES = ("raw", "true reward")
 REMOVED, KEPT, COST = 0.936, 0.9, 0.05  # the paper's best reduction (J16); what is asked of a filter beside it
@@ -35,7 +36,7 @@ def said(values: np.ndarray) -> str:
 
 def tables(p: Published) -> list[Table]:
     """Return all tables for which there are results."""
-    makers = (_hacking, _pooled, _noise, _kick, _bonuses, _ablation, _rating, _distortion)
+    makers = (_hacking, _pooled, _noise, _kick, _bonuses, _legitimate, _ablation, _rating, _distortion)
     return [t for t in (*(make(p) for make in makers), _speed()) if t.rows]
 
 
@@ -217,6 +218,21 @@ def _bonuses(p: Published) -> Table:
     )
 
 
+def _legitimate(p: Published) -> Table:
+    rows = [
+        (r["region"], r["mitigation"], r["panel"], *(said(p.per_seed(r, m)) for m in METRICS))
+        for r in p.rows(LEGITIMATE)
+    ]
+    return Table(
+        f"Twins whose bonus is real: Hopper, PPO, {_steps(p, LEGITIMATE)}",
+        ("region", "learns from", "panel", *HEADS),
+        tuple(rows),
+        3,
+        "The raw agent is right here, and whoever stays away from the region is too cautious. The raters still contest "
+        "its steps, as those of the paper do.",
+    )
+
+
 def _ablation(p: Published) -> Table:
     rows = [
         (r["agent"], r["region"], r["variant"], r["panel"], *(said(p.per_seed(r, m)) for m in METRICS))
@@ -292,7 +308,20 @@ def _speed() -> Table:
 
 def losses(p: Published) -> list[str]:
     """Say where ``uard`` misses what is asked of it in MuJoCo, found by rule."""
-    return _of_hacking(p) + _of_noise(p) + _of_distortion(p)
+    return _of_hacking(p) + _of_noise(p) + _of_twins(p) + _of_distortion(p)
+
+
+def _of_twins(p: Published) -> list[str]:
+    dear = []
+    for r in p.rows(LEGITIMATE, mitigation="uard"):
+        (raw,) = p.rows(LEGITIMATE, mitigation="raw", region=r["region"]) or (None,)
+        if raw is not None and (kept := p.of(r, "true_return").mean / p.of(raw, "true_return").mean) < 1 - COST:
+            dear.append(f"{r['region']} {r['panel']} {100 * (1 - kept):.0f} %")
+    if not dear:
+        return []
+    return [
+        f"MuJoCo, Hopper, bonuses that are real: uard's caution costs more than 5 % of the true return{_listed(dear)}."
+    ]
 
 
 def _of_distortion(p: Published) -> list[str]:

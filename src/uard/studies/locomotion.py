@@ -181,6 +181,22 @@ def distortion(scale: Scale) -> tuple[Row, ...]:
     )
 
 
+def legitimate(scale: Scale) -> tuple[Row, ...]:
+    """Twins whose bonus is real: what caution costs where there is nothing to prevent. Hopper, PPO."""
+    agent, steps = scale.agents["ppo"]
+    return tuple(
+        row(
+            _cell(Locomotion(region=region(), legitimate=True), named(mitigation), agent, steps, panel=panel),
+            region=which,
+            mitigation=mitigation,
+            panel=panel,
+        )
+        for which, region in REGIONS.items()
+        for mitigation in ("raw", "uard")
+        for panel in (PANELS if named(mitigation).reads_feedback else PANELS[:1])
+    )
+
+
 def rating(scale: Scale) -> tuple[Row, ...]:
     """Which steps are rated: at random, or half of them where the model of ratings knows least. Hopper, PPO."""
     agent, steps = scale.agents["ppo"]
@@ -206,6 +222,7 @@ def studies(scale: Scale) -> tuple[Study, ...]:
         Study(f"{of}-noise", f"Violations against noise, {scale.name}", "H11, G11, J25", noise(scale)),
         Study(f"{of}-kick", f"A kick, {scale.name}", "H12, G10", kick(scale)),
         Study(f"{of}-ablation", f"Which source does the work in MuJoCo, {scale.name}", "H8", ablation(scale)),
+        Study(f"{of}-legitimate", f"Bonuses that are real, {scale.name}", "over-caution", legitimate(scale)),
         Study(f"{of}-rating", f"Which steps are rated, {scale.name}", "DESIGN: active rating", rating(scale)),
         Study(
             f"{of}-distortion",
