@@ -18,13 +18,12 @@ Physics, task reward, observation and the end of an episode are Gymnasium's v4 o
 from __future__ import annotations
 
 import os
-import weakref
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
-from queue import SimpleQueue
-from threading import Thread
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -281,50 +280,6 @@ def model(robot: str, version: int) -> Any:
     return loaded
 
 
-def _integrate(step: Callable[..., None], model: Any, waiting: list[Any]) -> None:
-    # Nothing else in this loop: MuJoCo lets go of Python's lock while it steps, and threads that touch arrays between
-    # steps wait for each other most of the time. A thread takes the next copy when it is free: one wakes up later.
-    while True:
-        try:
-            data = waiting.pop()
-        except IndexError:
-            return
-        step(model, data, SUBSTEPS)
-
-
-class Helper:
-    """A thread that does one piece of work again and again; an executor's bookkeeping costs a third of a short step."""
-
-    def __init__(self, work: Callable[[], None]):
-        """Start the thread; it holds ``work`` and nothing else."""
-        self._begin: SimpleQueue[bool] = SimpleQueue()
-        self._end: SimpleQueue[BaseException | None] = SimpleQueue()
-        Thread(target=self._serve, args=(work, self._begin, self._end), daemon=True).start()
-
-    @staticmethod
-    def _serve(work: Callable[[], None], begin: SimpleQueue[bool], end: SimpleQueue[BaseException | None]) -> None:
-        while begin.get():
-            try:
-                work()
-            except BaseException as error:
-                end.put(error)
-            else:
-                end.put(None)
-
-    def begin(self) -> None:
-        """Let it do its work once."""
-        self._begin.put(True)
-
-    def end(self) -> None:
-        """Wait until it has; raises what the work raised."""
-        if error := self._end.get():
-            raise error
-
-    def leave(self) -> None:
-        """End the thread."""
-        self._begin.put(False)
-
-
 class Physics:
     """Several copies of a robot, stepped together.
 
@@ -351,10 +306,9 @@ class Physics:
         self._time = np.zeros(copies, np.int64)
         n = self._model.nv
         self._position, self._velocity, self._acceleration = (np.zeros((copies, n)) for _ in range(3))
-        self._waiting: list[Any] = []
-        self._work = partial(_integrate, mujoco.mj_step, self._model, self._waiting)
-        self._others = [Helper(self._work) for _ in range(min(threads, copies) - 1)]
-        self._leave = weakref.finalize(self, lambda helpers: [h.leave() for h in helpers], self._others)
+        cuts = np.linspace(0, copies, min(threads, copies) + 1).astype(int)
+        self._parts = [self._data[a:b] for a, b in pairwise(cuts)]
+        self._pool = ThreadPoolExecutor(len(self._parts) - 1) if len(self._parts) > 1 else None
         for i in range(copies):
             self.reset(i)
 
@@ -371,14 +325,19 @@ class Physics:
     def _advance(self, actions: Array) -> None:
         for data, action in zip(self._data, actions, strict=True):
             data.ctrl[:] = action
-        self._waiting.extend(self._data)
-        for other in self._others:
-            other.begin()
-        self._work()
-        for other in self._others:
-            other.end()
+        others = [self._pool.submit(self._integrate, part) for part in self._parts[1:]] if self._pool else []
+        self._integrate(self._parts[0])
+        for other in others:
+            other.result()
         for i, data in enumerate(self._data):
             self._position[i], self._velocity[i], self._acceleration[i] = data.qpos, data.qvel, data.qacc
+
+    def _integrate(self, part: list[Any]) -> None:
+        # Nothing else in this loop: MuJoCo lets go of Python's lock while it steps, and threads that touch arrays
+        # between steps wait for each other most of the time.
+        step, m = self._mujoco.mj_step, self._model
+        for data in part:
+            step(m, data, SUBSTEPS)
 
     def observe(self) -> Array:
         """Return the observations of all copies, (E, features)."""
@@ -494,7 +453,8 @@ class Physics:
 
     def close(self) -> None:
         """Let the threads go."""
-        self._leave()
+        if self._pool:
+            self._pool.shutdown()
 
 
 def rate(panel: str, moved: Moved, noise: float, random: np.random.Generator) -> Array:

@@ -138,14 +138,21 @@ def headline(p: Published) -> str:
         for m in ("uard", "uard-paper")
     }
     noisy = p.studies[NOISE].one(agent="ppo", mitigation="uard", noise=0.3)
-    honest = p.studies[HACKING].one(robot="hopper", region="vibration", agent="ppo", mitigation="true reward")
+    hopper = p.rows(HACKING, robot="hopper", agent="ppo")
+    (honest,) = (r for r in hopper if (r["region"], r["mitigation"]) == ("vibration", "true reward"))
+    plain = {r["mitigation"]: r for r in hopper if r["region"] == "none"}
+    _, by_sac = pooled(p, "hopper", "sac", "uard") or (None, None)
+    sac = f" SAC on Hopper keeps {said(100 * by_sac)} % ({len(by_sac)} seeds)." if by_sac is not None else ""
     return (
         f"PPO on the raw reward spends {min(raw):.0f} to {max(raw):.0f} steps of an episode where the reward lies, with "
         f"`uard` at most {number(max(ours))}. Over all settings of a robot `uard` keeps {kept['uard']} of the true return of "
         f"the agent trained on the true reward; as printed, {kept['uard-paper']}. "
         f"With noise of 30 % of the bonus on every rating (Hopper, vibration) it spends "
         f"{said(p.per_seed(noisy, 'trap_visits'))} steps where the reward lies and has a true return of "
-        f"{said(p.per_seed(noisy, 'true_return'))}; the honest agent has {said(p.per_seed(honest, 'true_return'))}."
+        f"{said(p.per_seed(noisy, 'true_return'))}; the honest agent has {said(p.per_seed(honest, 'true_return'))}. "
+        f"Without a lie (Hopper, {len(p.seeds_of(plain['uard']))} seeds) its true return is "
+        f"{said(p.per_seed(plain['uard'], 'true_return'))}, the raw agent's {said(p.per_seed(plain['raw'], 'true_return'))}."
+        f"{sac}"
     )
 
 
@@ -314,8 +321,8 @@ def losses(p: Published) -> list[str]:
 def _of_twins(p: Published) -> list[str]:
     dear = []
     for r in p.rows(LEGITIMATE, mitigation="uard"):
-        (raw,) = p.rows(LEGITIMATE, mitigation="raw", region=r["region"]) or (None,)
-        if raw is not None and (kept := p.of(r, "true_return").mean / p.of(raw, "true_return").mean) < 1 - COST:
+        _, kept = _compared(p, r, None, next(iter(p.rows(LEGITIMATE, mitigation="raw", region=r["region"])), None))
+        if kept is not None and kept < 1 - COST:
             dear.append(f"{r['region']} {r['panel']} {100 * (1 - kept):.0f} %")
     if not dear:
         return []

@@ -26,6 +26,11 @@ def _cell(environment: Locomotion, mitigation: Any, agent: Any, steps: int, **mo
     return Cell(environment, mitigation, agent, rated=RATED, steps=steps, **more)
 
 
+def _panels(mitigation: str) -> tuple[str, ...]:
+    """Return all panels, or one for who does not listen."""
+    return PANELS if named(mitigation).reads_feedback else PANELS[:1]
+
+
 @dataclass(frozen=True)
 class Scale:
     """How much of the studies is run.
@@ -97,7 +102,7 @@ def bonuses(scale: Scale) -> tuple[Row, ...]:
         for which, region in REGIONS.items()
         for bonus in (4.0, 6.0, 8.0)
         for mitigation in ("raw", "uard-operator", "uard")
-        for panel in (PANELS if named(mitigation).reads_feedback else PANELS[:1])
+        for panel in _panels(mitigation)
     )
 
 
@@ -193,7 +198,7 @@ def legitimate(scale: Scale) -> tuple[Row, ...]:
         )
         for which, region in REGIONS.items()
         for mitigation in ("raw", "uard")
-        for panel in (PANELS if named(mitigation).reads_feedback else PANELS[:1])
+        for panel in _panels(mitigation)
     )
 
 
