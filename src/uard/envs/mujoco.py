@@ -304,8 +304,11 @@ class Physics:
         self._whole = mujoco.mjtState.mjSTATE_INTEGRATION
         self._random = np.random.Generator(np.random.PCG64(seed))
         self._time = np.zeros(copies, np.int64)
-        n = self._model.nv
-        self._position, self._velocity, self._acceleration = (np.zeros((copies, n)) for _ in range(3))
+        # Views of MuJoCo's memory, made once: to ask a copy for them takes longer than to read them.
+        self._controls = [d.ctrl for d in self._data]
+        self._leaves = [getattr(d, name) for name in ("qpos", "qvel", "qacc") for d in self._data]
+        self._state = np.zeros((3, copies, self._model.nv))
+        self._position, self._velocity, self._acceleration = self._state
         cuts = np.linspace(0, copies, min(threads, copies) + 1).astype(int)
         self._parts = [self._data[a:b] for a, b in pairwise(cuts)]
         self._pool = ThreadPoolExecutor(len(self._parts) - 1) if len(self._parts) > 1 else None
@@ -323,14 +326,13 @@ class Physics:
         self._time[i] = 0
 
     def _advance(self, actions: Array) -> None:
-        for data, action in zip(self._data, actions, strict=True):
-            data.ctrl[:] = action
+        for control, action in zip(self._controls, actions, strict=True):
+            control[:] = action
         others = [self._pool.submit(self._integrate, part) for part in self._parts[1:]] if self._pool else []
         self._integrate(self._parts[0])
         for other in others:
             other.result()
-        for i, data in enumerate(self._data):
-            self._position[i], self._velocity[i], self._acceleration[i] = data.qpos, data.qvel, data.qacc
+        np.concatenate(self._leaves, out=self._state.reshape(-1))
 
     def _integrate(self, part: list[Any]) -> None:
         # Nothing else in this loop: MuJoCo lets go of Python's lock while it steps, and threads that touch arrays
@@ -359,7 +361,7 @@ class Physics:
             raise _checks.InvalidValueError("actions", float(worst), "within [-1, 1]")
         before = self._position[:, 0].copy()
         self._advance(actions)
-        finite = np.isfinite(self._position).all(1) & np.isfinite(self._velocity).all(1)
+        finite = np.isfinite(self._state[:2]).all((0, 2))
         if not finite.all():
             i = int(np.argmin(finite))
             raise PhysicsError(
