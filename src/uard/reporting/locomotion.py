@@ -20,7 +20,7 @@ from uard.reporting.tables import Table, full, number
 HACKING, NOISE, KICK = "mujoco-standard-hacking", "mujoco-standard-noise", "mujoco-standard-kick"
 DISTORTION, RATING = "mujoco-standard-distortion", "mujoco-standard-rating"
 BONUSES, ABLATION = "mujoco-standard-bonuses", "mujoco-standard-ablation"
-LEGITIMATE = "mujoco-standard-legitimate"
+LEGITIMATE, CAUTION = "mujoco-standard-legitimate", "mujoco-standard-caution"
 AS_GOOD = 0.03  # by how much the AUROC of a cheaper sigma_m may be lower
 REFERENCES = ("raw", "true reward")
 REMOVED, KEPT, COST = 0.936, 0.9, 0.05  # the paper's best reduction (J16); what is asked of a filter beside it
@@ -36,7 +36,7 @@ def said(values: np.ndarray) -> str:
 
 def tables(p: Published) -> list[Table]:
     """Return all tables for which there are results."""
-    makers = (_hacking, _pooled, _noise, _kick, _bonuses, _legitimate, _ablation, _rating, _distortion)
+    makers = (_hacking, _pooled, _noise, _kick, _bonuses, _legitimate, _caution, _ablation, _rating, _distortion)
     return [t for t in (*(make(p) for make in makers), _speed()) if t.rows]
 
 
@@ -240,6 +240,23 @@ def _legitimate(p: Published) -> Table:
     )
 
 
+def _caution(p: Published) -> Table:
+    rows = []
+    for r in p.rows(CAUTION):
+        _, kept = _compared(p, r, None, next(iter(p.rows(CAUTION, learns_from="raw")), None))
+        best = (said(x) for x in p.derived(r, "deterministic").T[1:])
+        share = "–" if kept is None else f"{100 * kept:.0f} %"
+        rows.append((r["learns_from"], said(p.per_seed(r, "true_return")), share, *best))
+    return Table(
+        f"What listening costs where nothing lies: Hopper, PPO, main panel, {_steps(p, CAUTION)}, 15 % of steps rated",
+        ("learns from", "true return", "of the raw agent's", "deterministic: true return"),
+        tuple(rows),
+        1,
+        "Only: the other doubt is left out of U (alpha or beta = 0). The mean and the lowest of the annotations are "
+        "learned from by themselves, without a filter.",
+    )
+
+
 def _ablation(p: Published) -> Table:
     rows = [
         (r["agent"], r["region"], r["variant"], r["panel"], *(said(p.per_seed(r, m)) for m in METRICS))
@@ -387,6 +404,11 @@ def _of_hacking(p: Published) -> list[str]:
         out.append(
             f"MuJoCo without a lie: uard costs more than 5 % of the true return in {len(dear)} of {len(plain)} "
             f"settings{_listed(dear)}."
+        )
+    parts = [f"{r['learns_from']} {said(p.per_seed(r, 'true_return'))}" for r in p.rows(CAUTION)]
+    if parts:
+        out.append(
+            f"MuJoCo without a lie, which part of listening costs (Hopper, PPO, true return): {'; '.join(parts)}."
         )
     return out
 

@@ -202,6 +202,25 @@ def legitimate(scale: Scale) -> tuple[Row, ...]:
     )
 
 
+def caution(scale: Scale) -> tuple[Row, ...]:
+    """What listening costs where nothing lies, and which part of it does: Hopper, PPO, main panel."""
+    agent, steps = scale.agents["ppo"]
+    plain = Locomotion(region=None)
+    variants: dict[str, tuple[str, dict[str, Any], float]] = {
+        "raw": ("raw", {}, RATED),
+        "uard": ("uard", {}, RATED),
+        "uard, every step rated": ("uard", {}, 1.0),
+        "uard, sigma_h only": ("uard", {"alpha": 0.0}, RATED),
+        "uard, sigma_m only": ("uard", {"beta": 0.0}, RATED),
+        "mean-of-annotations": ("mean-of-annotations", {}, RATED),
+        "worst-of-annotations": ("worst-of-annotations", {}, RATED),
+    }
+    return tuple(
+        row(replace(_cell(plain, named(mitigation, **changes), agent, steps), rated=rated), learns_from=label)
+        for label, (mitigation, changes, rated) in variants.items()
+    )
+
+
 def rating(scale: Scale) -> tuple[Row, ...]:
     """Which steps are rated: at random, or half of them where the model of ratings knows least. Hopper, PPO."""
     agent, steps = scale.agents["ppo"]
@@ -228,6 +247,7 @@ def studies(scale: Scale) -> tuple[Study, ...]:
         Study(f"{of}-kick", f"A kick, {scale.name}", "H12, G10", kick(scale)),
         Study(f"{of}-ablation", f"Which source does the work in MuJoCo, {scale.name}", "H8", ablation(scale)),
         Study(f"{of}-legitimate", f"Bonuses that are real, {scale.name}", "over-caution", legitimate(scale)),
+        Study(f"{of}-caution", f"What listening costs, {scale.name}", "over-caution", caution(scale)),
         Study(f"{of}-rating", f"Which steps are rated, {scale.name}", "DESIGN: active rating", rating(scale)),
         Study(
             f"{of}-distortion",
