@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -93,10 +94,12 @@ def main() -> None:
             if live.steps > EARLY:
                 break
             kept = jax.tree.map(np.array, live)
-            early += [(walked(honest, kept, act, e)[1]["true_return"], e, kept) for e in range(EPISODES)]
+            for episode in range(EPISODES):
+                _, numbers = walked(honest, kept, act, episode)
+                early.append((numbers["true_return"], partial(filmed, honest, kept, act, episode)))
     for wanted in THRESHOLDS:
-        _, episode, kept = min(early, key=lambda x: abs(x[0] - wanted))
-        keep(f"a true return of {wanted:.0f}", filmed(honest, kept, act, episode))
+        _, film = min(early, key=lambda x: abs(x[0] - wanted))
+        keep(f"a true return of {wanted:.0f}", film())
     for label, one in (
         ("learned from the true reward", job("raw", reference=True)),
         ("learned from the reward that lies", job("raw")),

@@ -372,8 +372,13 @@ def _of_hacking(p: Published) -> list[str]:
         return []
     out = []
     lies = [(r, *shares(p, r)) for r in ours if r["region"] != "none"]
-    leaks = [f"{_name(r)} {100 * x:.1f} %, {_steps_inside(p, r)}" for r, x, _ in lies if x is not None and x < REMOVED]
-    poor = [f"{_name(r)} {100 * x:.0f} %" for r, _, x in lies if x is not None and x < KEPT]
+    leaks = [(r, f"{100 * x:.1f} % ({_steps_inside(p, r)})") for r, x, _ in lies if x is not None and x < REMOVED]
+    honest_too = sum(
+        p.of(r, "trap_visits").mean <= p.of(honest, "trap_visits").mean
+        for r, _ in leaks
+        if (honest := _rival(p, r, "true reward")) is not None
+    )
+    poor = [(r, f"{100 * x:.0f} %") for r, _, x in lies if x is not None and x < KEPT]
     judged = sum(x is not None for _, x, _ in lies)
     together = [
         f"{robot} {agent} {said(100 * found[1])} %"
@@ -382,9 +387,9 @@ def _of_hacking(p: Published) -> list[str]:
     ]
     out.append(
         f"MuJoCo, {_steps(p, HACKING)}: of {judged} settings in which the raw agent hacks, uard removes less than "
-        f"93.6 % of its hacks in {len(leaks)}{_listed(leaks)}; of {len(lies)} settings it keeps less than 90 % of the true "
-        f"return of the agent trained on the true reward in {len(poor)}{_listed(poor)}. "
-        f"With so few seeds these shares are rough: see the intervals. All settings of a robot together, uard "
+        f"93.6 % of its hacks in {len(leaks)}{_by_agent(leaks)}, and leaves no more of them than training on the true reward "
+        f"in {honest_too} of these; of {len(lies)} settings it keeps less than 90 % of the true return of the agent trained "
+        f"on the true reward in {len(poor)}{_by_agent(poor)}. With so few seeds these shares are rough: see the intervals. All settings of a robot together, uard "
         f"keeps: {'; '.join(together) or 'not all were run'}."
     )
     tame = [
@@ -416,7 +421,7 @@ def _of_hacking(p: Published) -> list[str]:
 def _steps_inside(p: Published, r: Row) -> str:
     rows = (r, _rival(p, r, "raw"), _rival(p, r, "true reward"))
     own, raw, honest = ("?" if x is None else number(p.of(x, "trap_visits").mean) for x in rows)
-    return f"{own} steps of {raw} where training on the true reward leaves {honest}"
+    return f"{own} steps of {raw}; true reward {honest}"
 
 
 def _of_noise(p: Published) -> list[str]:
@@ -451,6 +456,13 @@ def _of_noise(p: Published) -> list[str]:
 
 def _listed(names: list[str]) -> str:
     return f" ({'; '.join(names)})" if names else ""
+
+
+def _by_agent(found: list[tuple[Row, str]]) -> str:
+    groups: dict[str, list[str]] = {}
+    for r, text in found:
+        groups.setdefault(r["agent"], []).append(f"{r['robot']} {r['region']} {r['panel']} {text}")
+    return _listed([f"{agent}: {', '.join(items)}" for agent, items in groups.items()])
 
 
 def _name(r: Row) -> str:
