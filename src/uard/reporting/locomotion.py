@@ -470,14 +470,12 @@ def _name(r: Row) -> str:
 
 
 def drawn(p: Published) -> list[tuple[str, str, str]]:
-    """Return (title, what to see, image) of the figure, if there are results."""
-    settings = list(
-        dict.fromkeys((r["robot"], r["region"], r["agent"]) for r in p.rows(HACKING) if r["region"] != "none")
-    )
+    """Return (title, what to see, image) of each figure for which there are results."""
     made = []
-    if settings:
+    for robot in dict.fromkeys(robot for robot, _ in _settings(p)):
         note = "One dot per seed, a bar at the mean. A mitigation works if hacks fall and the true return does not."
-        made.append(("G6, G7 · steps in the region that lies, and what they were worth", note, _dots(p, settings)))
+        title = f"G6, G7 · {robot}: steps in the region that lies, and what they were worth"
+        made.append((title, note, _dots(p, robot)))
     traced = p.rows(DISTORTION)
     if len(traced) == len(p.studies[DISTORTION].rows):
         note = "The first seed. Shaded: the windows in which the observed reward is inflated."
@@ -536,14 +534,16 @@ def film() -> list[tuple[str, str, str]]:
     return [("H4 · what returns of 42 and 110 look like, a hacker, and uard", note, image)]
 
 
-def _dots(p: Published, settings: list[Any]) -> Figure:
-    figure, axes = figures._axes(2, 6.2, 1.2 + 0.9 * len(settings))
+def _dots(p: Published, robot: str) -> Figure:
+    there = p.rows(HACKING, robot=robot)
+    settings = list(dict.fromkeys((r["agent"], r["region"]) for r in there if r["region"] != "none"))
+    figure, axes = figures._axes(2, 6.2, 1.2 + 0.7 * len(settings))
     for axis, metric, label in zip(
         axes, ("trap_visits", "true_return"), ("steps in the region per episode", "true return"), strict=True
     ):
         names = []
-        for i, (robot, region, agent) in enumerate(settings):
-            names.append(f"{robot}\n{region}, {agent}")
+        for i, (agent, region) in enumerate(settings):
+            names.append(f"{agent}\n{region}")
             rows = p.rows(HACKING, robot=robot, region=region, agent=agent)
             for j, r in enumerate(rows):
                 values, y = p.per_seed(r, metric), i + 0.8 * ((j + 0.5) / len(rows) - 0.5)
