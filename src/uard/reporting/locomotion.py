@@ -152,7 +152,24 @@ def headline(p: Published) -> str:
         f"{said(p.per_seed(noisy, 'true_return'))}; the honest agent has {said(p.per_seed(honest, 'true_return'))}. "
         f"Without a lie (Hopper, {len(p.seeds_of(plain['uard']))} seeds) its true return is "
         f"{said(p.per_seed(plain['uard'], 'true_return'))}, the raw agent's {said(p.per_seed(plain['raw'], 'true_return'))}."
-        f"{sac}"
+        f"{sac}{_others(p)}"
+    )
+
+
+def _others(p: Published) -> str:
+    parts, seeds = [], 0
+    for agent in dict.fromkeys(agent for _, agent in _settings(p) if agent not in ("ppo", "sac")):
+        found = [pooled(p, robot, agent, "uard") for robot in ("hopper", "walker2d")]
+        whole = [(100 * removed.mean(), 100 * kept.mean()) for removed, kept in filter(None, found)]
+        if len(whole) == len(found):
+            removed, kept = zip(*whole, strict=True)
+            seeds = max(seeds, *(len(f[0]) for f in found if f))
+            parts.append(f"{agent} {min(removed):.1f} and {min(kept):.0f} %")
+    if not parts:
+        return ""
+    return (
+        f" Other agents ({seeds} seed{'s' * (seeds > 1)}, the worse robot): of the raw agent's hacks `uard` removes, and of "
+        f"the honest agent's true return it keeps, {'; '.join(parts)}."
     )
 
 
