@@ -156,6 +156,20 @@ def test_shares_of_all_settings_together_by_hand():
     assert shown.pooled(p, "walker2d", "ppo", "uard") is None
 
 
+def test_other_agents_are_summed_up_by_their_worse_robot():
+    (study,) = (s for s in locomotion.studies(locomotion.STANDARD) if s.name == shown.HACKING)
+    hacks = {"raw": 100.0, "true reward": 0.0, "uard": 1.0, "uard-paper": 50.0}
+    true = {"raw": -5.0, "true reward": 400.0, "uard": 300.0, "uard-paper": 40.0}
+    cells = {}
+    for r in study.where(agent="trpo"):
+        worse = 2.0 if r["robot"] == "walker2d" and r["mitigation"] == "uard" else 1.0
+        metrics = {"trap_visits": [worse * hacks[r["mitigation"]]], "true_return": [true[r["mitigation"]] / worse]}
+        cells[r.cell.key] = {"seeds": [0], "metrics": metrics}
+    said = shown._others(Published(every(), [{"results": RESULTS, "cells": cells}]))
+    assert "(1 seed, the worse robot)" in said
+    assert "trpo 98.0 and 38 %" in said
+
+
 def test_the_film_has_a_strip_for_each_policy_and_says_what_it_is():
     ((title, note, image),) = shown.film()
     rows = packaged_json("hopper-frames.json")["rows"]
