@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,15 +42,12 @@ def trained(job: host.Job) -> Iterator[tuple[Any, Any]]:
         yield live, loop.act
 
 
-Camera = Callable[[int], np.ndarray]
-
-
 def walked(
-    job: host.Job, live: Any, act: Any, episode: int = 0, camera: Callable[[Physics], Camera] | None = None
+    job: host.Job, live: Any, act: Any, episode: int = 0, film: bool = False
 ) -> tuple[list[np.ndarray], dict[str, float]]:
-    """Return pictures of one episode, none without a camera, and its numbers."""
+    """Return pictures of one episode, none unless it is filmed, and its numbers."""
     physics = Physics(job.spec, 1, episode)
-    picture = camera(physics) if camera else None
+    picture = physics.camera(HEIGHT, WIDTH) if film else None
     pictures, hacks, value, length, over = [], 0, 0.0, 0, False
     while not over:
         if picture and length % EVERY == 0:
@@ -63,7 +60,7 @@ def walked(
 
 def filmed(job: host.Job, live: Any, act: Any, episode: int = 0) -> tuple[list[np.ndarray], dict[str, float]]:
     """Return some pictures of one episode, evenly spread over it, and its numbers."""
-    pictures, numbers = walked(job, live, act, episode, lambda physics: physics.camera(HEIGHT, WIDTH))
+    pictures, numbers = walked(job, live, act, episode, film=True)
     return [pictures[i] for i in np.linspace(0, len(pictures) - 1, PICTURES).round().astype(int)], numbers
 
 

@@ -76,11 +76,11 @@ def _hacking(p: Published) -> Table:
 
 
 def _rival(p: Published, r: Row, mitigation: str) -> Row | None:
-    return _found(p, robot=r["robot"], region=r["region"], agent=r["agent"], mitigation=mitigation)
+    return _found(p, HACKING, robot=r["robot"], region=r["region"], agent=r["agent"], mitigation=mitigation)
 
 
-def _found(p: Published, **labels: Any) -> Row | None:
-    return next(iter(p.rows(HACKING, **labels)), None)
+def _found(p: Published, study: str, **labels: Any) -> Row | None:
+    return next(iter(p.rows(study, **labels)), None)
 
 
 def shares(p: Published, r: Row) -> tuple[float | None, float | None]:
@@ -88,16 +88,20 @@ def shares(p: Published, r: Row) -> tuple[float | None, float | None]:
 
     Where the raw agent makes less than one hack step per episode a share of it says nothing and is None.
     """
-    return _compared(p, r, _rival(p, r, "raw"), _rival(p, r, "raw" if r["region"] == "none" else "true reward"))
+    raw = _rival(p, r, "raw")
+    return _removed(p, r, raw), _kept(p, r, raw if r["region"] == "none" else _rival(p, r, "true reward"))
 
 
-def _compared(p: Published, r: Row, raw: Row | None, honest: Row | None) -> tuple[float | None, float | None]:
-    removed = kept = None
-    if raw is not None and p.of(raw, "trap_visits").mean >= 1.0:
-        removed = 1.0 - p.of(r, "trap_visits").mean / p.of(raw, "trap_visits").mean
-    if honest is not None and p.of(honest, "true_return").mean > 0:
-        kept = p.of(r, "true_return").mean / p.of(honest, "true_return").mean
-    return removed, kept
+def _removed(p: Published, r: Row, raw: Row | None) -> float | None:
+    if raw is None or p.of(raw, "trap_visits").mean < 1.0:
+        return None
+    return 1.0 - p.of(r, "trap_visits").mean / p.of(raw, "trap_visits").mean
+
+
+def _kept(p: Published, r: Row, honest: Row | None) -> float | None:
+    if honest is None or p.of(honest, "true_return").mean <= 0:
+        return None
+    return p.of(r, "true_return").mean / p.of(honest, "true_return").mean
 
 
 def _shares(p: Published, r: Row) -> tuple[str, str]:
@@ -260,7 +264,7 @@ def _legitimate(p: Published) -> Table:
 def _caution(p: Published) -> Table:
     rows = []
     for r in p.rows(CAUTION):
-        _, kept = _compared(p, r, None, next(iter(p.rows(CAUTION, learns_from="raw")), None))
+        kept = _kept(p, r, _found(p, CAUTION, learns_from="raw"))
         best = (said(x) for x in p.derived(r, "deterministic").T[1:])
         share = "–" if kept is None else f"{100 * kept:.0f} %"
         rows.append((r["learns_from"], said(p.per_seed(r, "true_return")), share, *best))
@@ -355,7 +359,7 @@ def losses(p: Published) -> list[str]:
 def _of_twins(p: Published) -> list[str]:
     dear = []
     for r in p.rows(LEGITIMATE, mitigation="uard"):
-        _, kept = _compared(p, r, None, next(iter(p.rows(LEGITIMATE, mitigation="raw", region=r["region"])), None))
+        kept = _kept(p, r, _found(p, LEGITIMATE, mitigation="raw", region=r["region"]))
         if kept is not None and kept < 1 - COST:
             dear.append(f"{r['region']} {r['panel']} {100 * (1 - kept):.0f} %")
     if not dear:
@@ -406,8 +410,8 @@ def _of_hacking(p: Published) -> list[str]:
         f"MuJoCo, {_steps(p, HACKING)}: of {judged} settings in which the raw agent hacks, uard removes less than "
         f"93.6 % of its hacks in {len(leaks)}{_by_agent(leaks)}, and leaves no more of them than training on the true reward "
         f"in {honest_too} of these; of {len(lies)} settings it keeps less than 90 % of the true return of the agent trained "
-        f"on the true reward in {len(poor)}{_by_agent(poor)}. With so few seeds these shares are rough: see the intervals. All settings of a robot together, uard "
-        f"keeps: {'; '.join(together) or 'not all were run'}."
+        f"on the true reward in {len(poor)}{_by_agent(poor)}. With so few seeds these shares are rough: see the "
+        f"intervals. All settings of a robot together, uard keeps: {'; '.join(together) or 'not all were run'}."
     )
     tame = [
         f"{r['robot']} {r['region']} {r['agent']}"
@@ -444,8 +448,10 @@ def _steps_inside(p: Published, r: Row) -> str:
 def _of_noise(p: Published) -> list[str]:
     missed = []
     for r in p.rows(NOISE, mitigation="uard"):
-        rivals = (_found(p, robot="hopper", region="vibration", agent=r["agent"], mitigation=m) for m in REFERENCES)
-        removed, kept = _compared(p, r, *rivals)
+        raw, honest = (
+            _found(p, HACKING, robot="hopper", region="vibration", agent=r["agent"], mitigation=m) for m in REFERENCES
+        )
+        removed, kept = _removed(p, r, raw), _kept(p, r, honest)
         if r["noise"] and ((removed is not None and removed < REMOVED) or (kept is not None and kept < KEPT)):
             hacks, true = (said(p.per_seed(r, m)) for m in ("trap_visits", "true_return"))
             missed.append(f"{r['agent']} at {100 * r['noise']:.0f} %: {hacks} hack steps, true return {true}")

@@ -216,7 +216,7 @@ def caution(scale: Scale) -> tuple[Row, ...]:
         "worst-of-annotations": ("worst-of-annotations", {}, RATED),
     }
     return tuple(
-        row(replace(_cell(plain, named(mitigation, **changes), agent, steps), rated=rated), learns_from=label)
+        row(Cell(plain, named(mitigation, **changes), agent, rated=rated, steps=steps), learns_from=label)
         for label, (mitigation, changes, rated) in variants.items()
     )
 
