@@ -15,13 +15,14 @@ from pathlib import Path
 import uard.training  # noqa: F401  isort: skip  (sets XLA's flags)
 import numpy as np
 
-from uard.envs.trapgrid import paper_grid
-from uard.feedback.learned import RatingModel
-from uard.lab import cluster, names, runner
+from uard.envs.grids.trapgrid import paper_grid
+from uard.lab import registry as names
 from uard.lab.cell import Cell
+from uard.lab.execution import cluster, runner
+from uard.lab.execution.store import Store
 from uard.lab.result import Result
-from uard.lab.store import Store
-from uard.mitigation import named
+from uard.method.mitigations import named
+from uard.training.feedback.rating_model import RatingModel
 
 
 def cells():

@@ -30,7 +30,7 @@ import numpy as np
 
 import uard.training  # noqa: F401  (XLA's flags)
 from uard import __version__
-from uard.statistics import Summary, summarise
+from uard.lab.statistics import Summary, summarise
 
 CLEANRL = "CleanRL, published"
 # Mean and deviation over seeds of the last episodes at 1 M steps, v4, as CleanRL's documentation publishes them.
@@ -59,11 +59,11 @@ def ours(name: str, task: str, seeds: int) -> Returns:
 
 
 def _in_mujoco(name: str, task: str, seeds: int) -> Returns:
-    from uard.envs.mujoco import Locomotion
-    from uard.lab.names import continuous_agents
-    from uard.mitigation import named
-    from uard.training import host
-    from uard.training.lanes import LOG
+    from uard.envs.locomotion.physics import Locomotion
+    from uard.lab.registry import continuous_agents
+    from uard.method.mitigations import named
+    from uard.training.episode_log import LOG
+    from uard.training.host import loop as host
 
     budget, found = BUDGETS[name, task], []
     for seed in range(seeds):
@@ -74,13 +74,15 @@ def _in_mujoco(name: str, task: str, seeds: int) -> Returns:
 
 
 def _compiled(name: str, task: str, seeds: int) -> Returns:
+    from uard.agents.networks import Network
     from uard.agents.policy import PPO, TRPO
     from uard.agents.value import DeepQ
-    from uard.envs.classic import Acrobot, CartPole
-    from uard.mitigation import named
-    from uard.networks import Network
-    from uard.training import deep, lanes, off_policy, on_policy
-    from uard.training.lanes import LOG
+    from uard.envs.classic.specs import Acrobot, CartPole
+    from uard.method.mitigations import named
+    from uard.training.compiled import common as deep
+    from uard.training.compiled import off_policy, on_policy
+    from uard.training.compiled import runs as lanes
+    from uard.training.episode_log import LOG
 
     network = Network(learning_rate=RATE, value_scale=VALUE_SCALE.get((name, task), 30.0))
     agents: dict[str, Any] = {

@@ -60,12 +60,14 @@ def ours(kind: str, members: int, mitigation: str) -> Callable[[int], float]:
     """Return a function that trains for some steps and gives steps per second."""
     import jax
 
+    from uard.agents.networks import Ensemble
     from uard.agents.value import DeepQ
-    from uard.envs.trapgrid import paper_grid
-    from uard.feedback.learned import RatingModel
-    from uard.mitigation import named
-    from uard.networks import Ensemble
-    from uard.training import deep, lanes, off_policy
+    from uard.envs.grids.trapgrid import paper_grid
+    from uard.method.mitigations import named
+    from uard.training.compiled import common as deep
+    from uard.training.compiled import off_policy
+    from uard.training.compiled import runs as lanes
+    from uard.training.feedback.rating_model import RatingModel
 
     agent = DeepQ(ensemble=Ensemble(kind, members), buffer=BUFFER, batch=BATCH, warmup=WARMUP, target_every=TARGET)
     world = paper_grid(10, horizon=100).world()

@@ -23,16 +23,16 @@ import numpy as np
 from rich.console import Console
 
 from uard.agents.tabular import QLearning
-from uard.envs.trapgrid import TrapGrid
-from uard.lab import runner
+from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store
 from uard.lab.result import Result
-from uard.lab.store import Store
 from uard.lab.study import Row, Study
-from uard.mitigation import named
-from uard.reporting.evidence import Evidence
-from uard.reporting.status import lines, status
-from uard.reporting.tables import study_table
+from uard.lab.views.evidence import Evidence
+from uard.lab.views.status import lines, status
+from uard.lab.views.tables import study_table
+from uard.method.mitigations import named
 
 
 def overhead(batches: int, folder: Path) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """What returns of 42 and 110 look like, a hacker and a ``uard`` agent: Hopper, PPO, posture, filmed (a few minutes).
 
-    MUJOCO_GL=egl python benchmarks/frames.py --folder src/uard/reporting/results
+    MUJOCO_GL=egl python benchmarks/frames.py --folder src/uard/replication/results
 
 Writes ``hopper-frames.webp``, a row of pictures per policy, and ``hopper-frames.json``, which says what each one is.
 All act with their most likely actions. 42 and 110 are the paper's thresholds: shown is, of some episodes of each policy
@@ -21,11 +21,11 @@ import numpy as np
 from PIL import Image
 
 import uard
-from uard.envs.mujoco import Locomotion, Physics, Posture
-from uard.lab.names import continuous_agents
-from uard.mitigation import named
-from uard.studies.locomotion import RATED, STANDARD
-from uard.training import host
+from uard.envs.locomotion.physics import Locomotion, Physics, Posture
+from uard.lab.registry import continuous_agents
+from uard.method.mitigations import named
+from uard.replication.studies.locomotion import RATED, STANDARD
+from uard.training.host import loop as host
 
 THRESHOLDS = (42.0, 110.0)
 PICTURES, HEIGHT, WIDTH, EVERY = 8, 120, 120, 2

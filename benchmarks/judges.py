@@ -2,7 +2,7 @@
 
 Trains the example examples/grpo_three_judges.py in every way below. "over training" is the mean over all completions,
 "at the end" over those of the last five steps; mean and standard deviation over seeds. Under each way with a discount:
-how far it changes the advantages (see uard.adapters.trl.advantage_change), and how many groups are discounted.
+how far it changes the advantages (see uard.adapters.trl.reward.advantage_change), and how many groups are discounted.
 """
 
 import argparse
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from uard.adapters.trl import UncertaintyDiscountedReward
-from uard.mitigation import named
+from uard.method.mitigations import named
 
 warnings.filterwarnings("ignore", category=FutureWarning)
 PATH = Path(__file__).parents[1] / "examples" / "grpo_three_judges.py"

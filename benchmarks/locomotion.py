@@ -30,7 +30,7 @@ for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 import numpy as np
 
 import uard.training  # noqa: F401  (XLA's flags)
-from uard.envs.mujoco import ROBOTS, Locomotion, Physics, cores
+from uard.envs.locomotion.physics import ROBOTS, Locomotion, Physics, cores
 
 IDS = {"hopper": "Hopper-v4", "walker2d": "Walker2d-v4"}
 COPIES = (8, 32)
@@ -103,8 +103,8 @@ def sac_flops(critics: int, shared: bool, hidden: int = 256, batch: int = 256) -
 
 
 def our_sac(agent: Any, mitigation: str, updates: int) -> Rate:
-    from uard.mitigation import named
-    from uard.training import host
+    from uard.method.mitigations import named
+    from uard.training.host import loop as host
 
     steps = updates + agent.warmup
     job = host.Job(Locomotion(region=None), agent, named(mitigation), 0, 10**6)
@@ -159,9 +159,9 @@ def their_sac(library: str, updates: int) -> Rate:
 
 
 def our_ppo(mitigation: str, rollouts: int) -> Rate:
-    from uard.lab.names import continuous_agents
-    from uard.mitigation import named
-    from uard.training import host
+    from uard.lab.registry import continuous_agents
+    from uard.method.mitigations import named
+    from uard.training.host import loop as host
 
     job = host.Job(Locomotion(region=None), continuous_agents()["ppo"], named(mitigation), 0, 10**6)
     loop = host.bind(job)

@@ -37,11 +37,11 @@ from rich.console import Console
 from rich.table import Table
 
 from uard.agents.tabular import QLearning
-from uard.envs import panels
-from uard.envs.trapgrid import paper_grid
-from uard.mitigation import named
-from uard.training import fused
-from uard.training.lanes import LOG
+from uard.envs.grids.trapgrid import paper_grid
+from uard.method.mitigations import named
+from uard.ratings import panels
+from uard.training.compiled import tabular as fused
+from uard.training.episode_log import LOG
 
 GRID = paper_grid(10)
 AGENT = QLearning(heads=5)

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from uard import studies
-from uard.lab import runner
-from uard.lab.store import Store
-from uard.reporting import figures
-from uard.reporting.evidence import Evidence
+from uard.lab import studies
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store
+from uard.lab.views.evidence import Evidence
+from uard.replication import figures
 
 
 def main() -> None:

@@ -8,8 +8,9 @@ import csv
 
 import numpy as np
 
-from uard import doctor, logs
-from uard.diagnosis import filtered
+from uard import doctor
+from uard.diagnosis.doctor import filtered
+from uard.ratings import readers as logs
 
 random = np.random.default_rng(0)
 quality = random.normal(0.0, 1.0, 300)  # what an answer is worth; nobody but this script knows

@@ -1,13 +1,13 @@
 """I study reward hacking: agents x mitigations x seeds as data, trained once, with intervals (about a minute)."""
 
 from uard.agents.tabular import QLearning
-from uard.envs.trapgrid import TrapGrid
-from uard.lab import runner
+from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store
 from uard.lab.result import summaries
-from uard.lab.store import Store
 from uard.lab.study import results_of
-from uard.mitigation import named
+from uard.method.mitigations import named
 
 SEEDS = range(5)
 

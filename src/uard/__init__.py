@@ -12,31 +12,31 @@ from uard._version import __version__
 
 if TYPE_CHECKING:
     from uard._checks import InvalidValueError, UnknownNameError
-    from uard.abstention import Abstention
-    from uard.diagnosis import Diagnosis, Finding, doctor
-    from uard.logs import RatingLog
-    from uard.mitigation import Evidence, Feedback, LearningSignal, Mitigation, RewardDiscounting
-    from uard.reliability import ReliabilityFilter, discount, total_uncertainty
-    from uard.uncertainty import sigma_human, sigma_model
+    from uard.diagnosis.doctor import Diagnosis, Finding, doctor
+    from uard.method.abstention import Abstention
+    from uard.method.mitigations import Evidence, Feedback, LearningSignal, Mitigation, RewardDiscounting
+    from uard.method.uncertainty import sigma_human, sigma_model
+    from uard.method.weights import ReliabilityFilter, discount, total_uncertainty
+    from uard.ratings.readers import RatingLog
 
 _HOME = {
     "InvalidValueError": "_checks",
     "UnknownNameError": "_checks",
-    "Abstention": "abstention",
-    "Diagnosis": "diagnosis",
-    "Finding": "diagnosis",
-    "doctor": "diagnosis",
-    "RatingLog": "logs",
-    "Evidence": "mitigation",
-    "Feedback": "mitigation",
-    "LearningSignal": "mitigation",
-    "Mitigation": "mitigation",
-    "RewardDiscounting": "mitigation",
-    "ReliabilityFilter": "reliability",
-    "discount": "reliability",
-    "total_uncertainty": "reliability",
-    "sigma_human": "uncertainty",
-    "sigma_model": "uncertainty",
+    "Abstention": "method.abstention",
+    "Diagnosis": "diagnosis.doctor",
+    "Finding": "diagnosis.doctor",
+    "doctor": "diagnosis.doctor",
+    "RatingLog": "ratings.readers",
+    "Evidence": "method.mitigations",
+    "Feedback": "method.mitigations",
+    "LearningSignal": "method.mitigations",
+    "Mitigation": "method.mitigations",
+    "RewardDiscounting": "method.mitigations",
+    "ReliabilityFilter": "method.weights",
+    "discount": "method.weights",
+    "total_uncertainty": "method.weights",
+    "sigma_human": "method.uncertainty",
+    "sigma_model": "method.uncertainty",
 }
 
 __all__ = [

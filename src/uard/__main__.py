@@ -1,6 +1,6 @@
 """``python -m uard`` is ``uard``."""
 
-from uard.cli import main
+from uard.cli.app import main
 
 if __name__ == "__main__":
     main()

@@ -9,11 +9,11 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 
 import uard.envs  # noqa: F401 registers the ids
 from uard import InvalidValueError
-from uard.abstention import Abstention
 from uard.adapters.gymnasium import ReliabilityWrapper, VectorReliabilityWrapper
+from uard.adapters.reward_ensemble import RewardEnsemble
 from uard.adapters.steps import INFO
-from uard.ensemble import RewardEnsemble
-from uard.mitigation import RatedReward, Raw
+from uard.method.abstention import Abstention
+from uard.method.mitigations import RatedReward, Raw
 
 GRID = "uard/TrapGrid6-v0"
 

@@ -15,7 +15,7 @@ import uard.envs  # noqa: F401 registers the ids
 from uard import InvalidValueError
 from uard.adapters.gymnasium import ReliabilityWrapper
 from uard.adapters.sb3 import CriticDisagreement, ReliabilityCallback, ReliabilityReplayBuffer, ReliabilityVecEnv
-from uard.mitigation import RatedReward, Raw, named
+from uard.method.mitigations import RatedReward, Raw, named
 
 GRID = "uard/TrapGrid6-v0"
 

@@ -33,7 +33,7 @@ from uard.adapters.trl import (
     groups_of,
     keeps_factor,
 )
-from uard.mitigation import named, uard
+from uard.method.mitigations import named, uard
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "grpo_three_judges.py"
 
@@ -487,10 +487,10 @@ def test_the_reward_needs_neither_trl_nor_torch():
 
 
 def test_other_names_do_not_resolve():
-    import uard.adapters.trl
+    import uard.adapters.trl.reward
 
     with pytest.raises(AttributeError, match="has no attribute 'nonsense'"):
-        uard.adapters.trl.nonsense  # noqa: B018
+        uard.adapters.trl.reward.nonsense  # noqa: B018
 
 
 def test_pickling_keeps_all_that_is_known():

@@ -12,11 +12,15 @@ from unittest.mock import ANY
 import numpy as np
 import pytest
 
-from uard import __version__, cli, mitigation, studies
-from uard.envs.panels import PANELS
-from uard.lab import names, runner
+from uard import __version__
+from uard.cli.app import main as cli
+from uard.lab import registry as names
+from uard.lab import studies
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store
 from uard.lab.result import METRICS, Result
-from uard.lab.store import Store
+from uard.method import mitigations as mitigation
+from uard.ratings.panels import PANELS
 
 UARD = str(Path(sys.executable).parent / "uard")
 RUN = ["run", "TrapGrid", "--set", "size=5", "--set", "traps=[[2,2]]", "--episodes", "60", "--seeds", "2"]

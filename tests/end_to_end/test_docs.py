@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from uard import studies
-from uard.lab import runner
-from uard.lab.store import Store
-from uard.reporting import locomotion
-from uard.reporting.evidence import Evidence
-from uard.reporting.published import packaged
+from uard.lab import studies
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store
+from uard.lab.views.evidence import Evidence
+from uard.lab.views.published import packaged
+from uard.replication import locomotion
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]

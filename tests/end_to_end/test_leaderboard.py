@@ -7,15 +7,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uard import InvalidValueError, cli, statistics
+from uard import InvalidValueError
 from uard.agents.tabular import QLearning
-from uard.envs.trapgrid import TrapGrid
-from uard.lab import runner
+from uard.cli.app import main as cli
+from uard.envs.grids.trapgrid import TrapGrid
+from uard.lab import statistics
 from uard.lab.cell import Cell
-from uard.lab.store import Store
-from uard.mitigation import named
-from uard.reporting import leaderboard
-from uard.reporting.leaderboard import Estimate, Line, lines, standings
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store
+from uard.lab.views import leaderboard
+from uard.lab.views.leaderboard import Estimate, Line, lines, standings
+from uard.method.mitigations import named
 
 GRID = TrapGrid(size=4, traps=((1, 2),), horizon=12)
 HEADS = [

@@ -7,16 +7,20 @@ from pathlib import Path
 
 import pytest
 
-from uard import InvalidValueError, cli, mitigation, plugins, studies
+from uard import InvalidValueError, plugins
 from uard._checks import UnknownNameError
 from uard.agents.tabular import QLearning
-from uard.lab import names, runner
+from uard.cli.app import main as cli
+from uard.lab import registry as names
+from uard.lab import studies
 from uard.lab.cell import Cell
-from uard.lab.store import Store
-from uard.mitigation import Raw, named
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store
+from uard.lab.studies import plugins as own
+from uard.lab.views import leaderboard
+from uard.method import mitigations as mitigation
+from uard.method.mitigations import Raw, named
 from uard.plugins import PluginError
-from uard.reporting import leaderboard
-from uard.studies import own
 
 pytestmark = pytest.mark.slow
 
@@ -249,7 +253,7 @@ def test_what_packages_bring_has_a_study(example):
 
 
 def test_nothing_is_imported_before_it_is_asked_for(installed):
-    code = "import sys, uard.mitigation as m; m.named('uard'); print('uard_plugin_example' in sys.modules)"
+    code = "import sys, uard.method.mitigations as m; m.named('uard'); print('uard_plugin_example' in sys.modules)"
     path = os.pathsep.join([str(installed), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=os.environ | {"PYTHONPATH": path})
     assert done.stdout.strip() == b"False"

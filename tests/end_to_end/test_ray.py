@@ -8,15 +8,16 @@ from dataclasses import dataclass
 
 import pytest
 
-from uard import InvalidValueError, LearningSignal, Mitigation, cli
+from uard import InvalidValueError, LearningSignal, Mitigation
 from uard.agents.tabular import QLearning
-from uard.envs.trapgrid import TrapGrid
-from uard.lab import cluster, runner
+from uard.cli.app import main as cli
+from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
-from uard.lab.cluster import ClusterError, Ray
-from uard.lab.runner import StudyFailedError
-from uard.lab.store import Store
-from uard.mitigation import named
+from uard.lab.execution import cluster, runner
+from uard.lab.execution.cluster import ClusterError, Ray
+from uard.lab.execution.runner import StudyFailedError
+from uard.lab.execution.store import Store
+from uard.method.mitigations import named
 
 # Ray leaves its own processes to end on their own.
 pytestmark = [

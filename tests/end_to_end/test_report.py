@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from uard.reporting.ledger import VERDICTS
+from uard.replication.ledger import VERDICTS
 
 pytestmark = pytest.mark.slow
 

@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 
 from uard.agents.tabular import QLearning
-from uard.envs.trapgrid import TrapGrid
+from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
-from uard.lab.store import Store
+from uard.lab.execution.store import Store
 
 KILLS = int(os.environ.get("UARD_KILLS", "8"))
 JOBS, WORKERS = 30, 2
@@ -131,7 +131,7 @@ def pause(process, path):
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
-    from uard.lab import runner
+    from uard.lab.execution import runner
 
     path = tmp_path_factory.mktemp("undisturbed") / "s.sqlite"
     with closing(Store(path)) as store:
@@ -183,7 +183,7 @@ def test_killed_at_random_points_a_study_ends_as_if_nothing_had_happened(study, 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_signal_ends_the_real_program_at_once_with_its_code(tmp_path, number, code):
-    program = "import signal; signal.signal(2, signal.default_int_handler); from uard.cli import main; main()"
+    program = "import signal; signal.signal(2, signal.default_int_handler); from uard.cli.app import main; main()"
     command = [sys.executable, "-c", program, "reproduce", "scale", "--seeds", "40"]
     log = tmp_path / "log"
     process = subprocess.Popen(
@@ -251,7 +251,7 @@ def test_workers_end_with_their_parent(study):
 
 def test_a_full_disk_loses_nothing_and_the_same_command_goes_on(tmp_path):
     limited = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000)); "
-    program, arguments = "from uard.cli import main; main()", ["reproduce", "control", "--seeds", "30"]
+    program, arguments = "from uard.cli.app import main; main()", ["reproduce", "control", "--seeds", "30"]
     arguments += ["--store", "s.sqlite", "--workers", "1"]
     options = {"cwd": tmp_path, "capture_output": True, "text": True, "check": False}
 

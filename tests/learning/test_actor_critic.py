@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from uard.agents.actor_critic import SoftActorCritic
-from uard.envs.tabular import HiddenTruth, Ratings, Task
+from uard.agents.networks import Ensemble, Network
+from uard.envs.tables import HiddenTruth, Ratings, Task
 from uard.envs.world import table_world
-from uard.mitigation import named
-from uard.networks import Ensemble, Network
-from uard.training import deep, lanes, off_policy
-from uard.training.deep import QUANTITIES, Lane, Program
+from uard.method.mitigations import named
+from uard.training.compiled import common as deep
+from uard.training.compiled import off_policy
+from uard.training.compiled import runs as lanes
+from uard.training.compiled.common import QUANTITIES, Lane, Program
 
 # One program for all: EDAC, of which SAC is a case in numbers.
 PROGRAM = Program(episodes=2500, steps=2500, walk=8)

@@ -7,12 +7,12 @@ import pytest
 from scipy import stats
 
 from uard.agents.tabular import QLearning
-from uard.envs.trapgrid import TrapGrid, paper_grid
-from uard.lab import runner
+from uard.envs.grids.trapgrid import TrapGrid, paper_grid
 from uard.lab.cell import Cell
-from uard.lab.store import Store
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store
 from uard.lab.study import metrics_of
-from uard.mitigation import named
+from uard.method.mitigations import named
 
 pytestmark = pytest.mark.slow
 

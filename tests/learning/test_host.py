@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 from uard.agents.continuous import ensemble_sac, sac
+from uard.agents.networks import Ensemble, Network
 from uard.agents.policy import CPO, PPO, TRPO
-from uard.envs.mujoco import Kick, Locomotion, Spikes, Vibration
-from uard.feedback import transitions
-from uard.feedback.transitions import TransitionModel
-from uard.lab.names import continuous_agents
-from uard.mitigation import Feedback, named
-from uard.networks import Ensemble, Network
-from uard.training import host
+from uard.envs.locomotion.physics import Kick, Locomotion, Spikes, Vibration
+from uard.lab.registry import continuous_agents
+from uard.method.mitigations import Feedback, named
 from uard.training.checkpoint import CheckpointError
-from uard.training.host import Job
+from uard.training.feedback import transition_model as transitions
+from uard.training.feedback.transition_model import TransitionModel
+from uard.training.host import loop as host
+from uard.training.host.loop import Job
 
 TINY = Network(16, 1e-3, 100.0)
 ON = {"network": TINY, "ensemble": Ensemble("shared", 3), "envs": 4, "rollout": 32, "epochs": 2, "count_bonus": 0.0}
@@ -151,7 +151,7 @@ def test_doubtful_steps_are_rated_in_both_loops_and_as_many():
 
 def test_a_state_that_is_not_finite_stops_the_run_and_the_last_good_one_stays(tmp_path, monkeypatch):
     path = tmp_path / "run"
-    from uard.training import host_on_policy
+    from uard.training.host import on_policy as host_on_policy
 
     real, calls = host_on_policy._learn, []
 

@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 
 from uard.agents.policy import CPO, PPO, TRPO
-from uard.envs.tabular import HiddenTruth, Ratings, Task
-from uard.envs.trapgrid import paper_grid
+from uard.envs.grids.trapgrid import paper_grid
+from uard.envs.tables import HiddenTruth, Ratings, Task
 from uard.envs.world import TableWorld, table_world
-from uard.mitigation import named
-from uard.training import deep, lanes, on_policy
-from uard.training.lanes import LOG
+from uard.method.mitigations import named
+from uard.training.compiled import common as deep
+from uard.training.compiled import on_policy
+from uard.training.compiled import runs as lanes
+from uard.training.episode_log import LOG
 
 VISITS, TRUE, OBSERVED, GOAL, LENGTH, _ = range(len(LOG))
 GAMMA = 0.8

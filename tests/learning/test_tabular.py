@@ -10,16 +10,17 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from uard.abstention import Abstention
 from uard.agents import tabular
 from uard.agents.tabular import QLearning
-from uard.envs import panels
-from uard.envs.tabular import HiddenTruth, Ratings, Task
-from uard.envs.trapgrid import TrapGrid, paper_grid
-from uard.mitigation import NAMED, named
-from uard.training import fused, lanes
-from uard.training.fused import Lane, Outcome, Program
-from uard.training.lanes import LOG
+from uard.envs.grids.trapgrid import TrapGrid, paper_grid
+from uard.envs.tables import HiddenTruth, Ratings, Task
+from uard.method.abstention import Abstention
+from uard.method.mitigations import NAMED, named
+from uard.ratings import panels
+from uard.training.compiled import runs as lanes
+from uard.training.compiled import tabular as fused
+from uard.training.compiled.tabular import Lane, Outcome, Program
+from uard.training.episode_log import LOG
 from uard.training.xla import COMPILER_OPTIONS
 
 # One program length for all tests, so that what agrees in shapes and classes is compiled once.

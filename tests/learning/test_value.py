@@ -12,15 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from uard.agents.networks import SINGLE, Ensemble, Network
 from uard.agents.off_policy import Batch, Watched
 from uard.agents.value import DeepQ
-from uard.envs.tabular import HiddenTruth, Ratings, Task
+from uard.envs.tables import HiddenTruth, Ratings, Task
 from uard.envs.world import TableWorld, table_world
-from uard.mitigation import named
-from uard.networks import SINGLE, Ensemble, Network
-from uard.training import deep, lanes, off_policy
-from uard.training.deep import QUANTITIES, Lane, Program
-from uard.training.lanes import LOG
+from uard.method.mitigations import named
+from uard.training.compiled import common as deep
+from uard.training.compiled import off_policy
+from uard.training.compiled import runs as lanes
+from uard.training.compiled.common import QUANTITIES, Lane, Program
+from uard.training.episode_log import LOG
 
 # One program for all probes: as many steps, agents that differ in numbers alone, few states and rows.
 PROGRAM = Program(episodes=2500, steps=2500, walk=8)

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from uard import Feedback, ReliabilityFilter, RewardDiscounting
-from uard.reliability import FORMS
+from uard.method.weights import FORMS
 
 fractions = st.floats(0.0, 1.0)
 sigmas = st.floats(0.0, 100.0)

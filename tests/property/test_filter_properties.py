@@ -6,8 +6,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from uard import Evidence, Feedback, ReliabilityFilter, RewardDiscounting, discount
-from uard.mitigation import named
-from uard.reliability import FORMS
+from uard.method.mitigations import named
+from uard.method.weights import FORMS
 
 from . import strategies as some
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uard import Abstention, InvalidValueError
-from uard.abstention import uncertainty_ratio
+from uard.method.abstention import uncertainty_ratio
 
 
 @pytest.mark.parametrize(

@@ -25,9 +25,9 @@ from uard.agents.actor_critic import (
     soft_value,
     temperature_loss,
 )
+from uard.agents.networks import Ensemble, Network
 from uard.agents.off_policy import Batch, OffPolicy
-from uard.mitigation import LearningSignal
-from uard.networks import Ensemble, Network
+from uard.method.mitigations import LearningSignal
 
 FEATURES, ACTIONS, SCALE, RATE = 5, 3, 4.0, 1e-2
 NETWORK = Network(hidden=8, learning_rate=RATE, value_scale=SCALE)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from uard._checks import InvalidValueError
-from uard.adaptation import adaptive_lambda, standing, towards_target_discount
+from uard.method.adaptation import adaptive_lambda, standing, towards_target_discount
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from uard.envs.trapgrid import TrapGrid, paper_grid
-from uard.reporting import audit, paper
+from uard.envs.grids.trapgrid import TrapGrid, paper_grid
+from uard.replication import audit, paper
 
 
 @pytest.fixture(scope="module")

@@ -3,11 +3,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uard import bellman
 from uard._checks import InvalidValueError, UnknownNameError
-from uard.envs.tabular import Task
-from uard.envs.trapgrid import paper_grid
-from uard.reliability import ReliabilityFilter
+from uard.envs.grids.trapgrid import paper_grid
+from uard.envs.tables import Task
+from uard.method import bellman
+from uard.method.weights import ReliabilityFilter
 
 GAMMA = 0.95
 # State 0: action 0 stays and pays 1, action 1 ends the episode and pays 3.

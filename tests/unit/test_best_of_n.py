@@ -9,11 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uard import InvalidValueError, mitigation
-from uard.mitigation import Raw
-from uard.reporting import overoptimisation, published
-from uard.studies import best_of_n
-from uard.studies.best_of_n import METHODS, PANELS, Problem, divergence, draw, expected_best, filtered
+from uard import InvalidValueError
+from uard.lab.studies import best_of_n
+from uard.lab.studies.best_of_n import METHODS, PANELS, Problem, divergence, draw, expected_best, filtered
+from uard.lab.views import best_of_n as overoptimisation
+from uard.lab.views import published
+from uard.method import mitigations as mitigation
+from uard.method.mitigations import Raw
 
 SMALL = Problem(pool=10_000, models=3, pairs=60, width=8)
 

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from uard._checks import InvalidValueError
-from uard.calibration import auroc, reliability_diagram, spearman, tpr_at_fpr
+from uard.method.calibration import auroc, reliability_diagram, spearman, tpr_at_fpr
 
 HACKS, HONEST = [0.9, 0.6, 0.3], [0.8, 0.5, 0.4, 0.2, 0.1]
 SCORE, HACK = HACKS + HONEST, [True] * 3 + [False] * 5

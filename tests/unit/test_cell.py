@@ -10,11 +10,11 @@ import pytest
 
 from uard import InvalidValueError, LearningSignal, Mitigation, RewardDiscounting
 from uard._checks import UnknownNameError
-from uard.abstention import Abstention
 from uard.agents.tabular import QLearning
-from uard.envs.trapgrid import TrapGrid
+from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import RESULTS, Cell, plain
-from uard.mitigation import RatedReward, Raw, Screening, named
+from uard.method.abstention import Abstention
+from uard.method.mitigations import RatedReward, Raw, Screening, named
 
 GOLDEN = "f6c55a69918eb82029fdea2566d4ac39"
 FULL = Cell(
@@ -199,7 +199,7 @@ def test_changing_a_cell_checks_it_again():
 
 def test_the_configuration_is_plain_data_that_names_its_classes():
     config = json.loads(json.dumps(FULL.config(), allow_nan=False))
-    assert config["mitigation"]["class"] == "uard.mitigation.RewardDiscounting"
+    assert config["mitigation"]["class"] == "uard.method.mitigations.RewardDiscounting"
     assert config["mitigation"]["filter"]["lam"] == 0.2
     assert config["environment"]["traps"] == [[3, 3]]
     assert config == plain(FULL)

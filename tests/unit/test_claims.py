@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uard.lab import runner
 from uard.lab.cell import Cell
-from uard.lab.claims import LEASE, Owner
+from uard.lab.execution import runner
+from uard.lab.execution.claims import LEASE, Owner
+from uard.lab.execution.store import Store, StoreError, give_sign
 from uard.lab.result import Result
-from uard.lab.store import Store, StoreError, give_sign
 
 ONE, TWO = Cell(episodes=3), Cell(episodes=4)
 JOBS = [(ONE, 0), (ONE, 1), (TWO, 0)]
@@ -46,7 +46,7 @@ def owner():
 @pytest.fixture
 def stranger():
     """An owner in a process that has been killed and not been waited for."""
-    code = "from uard.lab.claims import Owner; import time; print(repr(Owner.here()), flush=True); time.sleep(60)"
+    code = "from uard.lab.execution.claims import Owner; import time; print(repr(Owner.here()), flush=True); time.sleep(60)"
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     yield process, eval(process.stdout.readline(), {"Owner": Owner})
     process.kill()

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from uard import InvalidValueError, UnknownNameError
-from uard.envs.classic import Acrobot, CartPole
-from uard.envs.panels import PANELS
+from uard.envs.classic.specs import Acrobot, CartPole
 from uard.envs.world import World
+from uard.ratings.panels import PANELS
 
 KEY = jax.random.key(0)
 SPECS = {"CartPole-v1": CartPole, "Acrobot-v1": Acrobot}

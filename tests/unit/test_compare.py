@@ -7,9 +7,9 @@ import pytest
 
 from uard import InvalidValueError
 from uard.lab.cell import Cell
+from uard.lab.execution.store import Store
 from uard.lab.result import METRICS, Result, digest
-from uard.lab.store import Store
-from uard.reporting.compare import LEVEL, _tested, as_data, compare, lines, title
+from uard.lab.views.compare import LEVEL, _tested, as_data, compare, lines, title
 
 CELLS = [Cell(episodes=3 + i) for i in range(4)]
 

@@ -12,7 +12,7 @@ from uard._checks import InvalidValueError, UnknownNameError
 from uard.agents import continuous
 from uard.agents.continuous import Batch, ContinuousActorCritic, cql, edac, ensemble_sac, sac, sunrise
 from uard.agents.heads import Normal
-from uard.networks import Ensemble, Network
+from uard.agents.networks import Ensemble, Network
 
 SMALL = {"network": Network(16, 1e-2, 1.0), "batch": 32, "buffer": 64, "warmup": 32}
 FAMILY = {"sac": sac, "cql": cql, "edac": edac, "sunrise": sunrise, "ensemble": ensemble_sac}

@@ -8,23 +8,26 @@ import subprocess
 import numpy as np
 import pytest
 
-from uard import InvalidValueError, studies
+from uard import InvalidValueError
+from uard.agents.networks import Network
 from uard.agents.off_policy import OffPolicy
 from uard.agents.policy import PolicyGradient
 from uard.agents.tabular import QLearning
 from uard.agents.value import DeepQ
-from uard.envs.gaming import BoatRace, TomatoWatering
-from uard.envs.learned_reward import LearnedRewardGrid
-from uard.envs.trapgrid import TrapGrid
-from uard.feedback.learned import RatingModel
-from uard.lab import examine, names, runner
+from uard.envs.grids.gaming import BoatRace, TomatoWatering
+from uard.envs.grids.learned_reward import LearnedRewardGrid
+from uard.envs.grids.trapgrid import TrapGrid
+from uard.lab import registry as names
+from uard.lab import studies
 from uard.lab.cell import Cell
-from uard.lab.store import Store
+from uard.lab.execution import examine, runner
+from uard.lab.execution.store import Store
 from uard.lab.study import Study, row
-from uard.mitigation import named
-from uard.networks import Network
-from uard.reporting import distortion, published
-from uard.reporting.published import BIN, Published, checkout, extract, packaged
+from uard.lab.views import published
+from uard.lab.views.published import BIN, Published, checkout, extract, packaged
+from uard.method.mitigations import named
+from uard.replication import distortion
+from uard.training.feedback.rating_model import RatingModel
 
 SMALL = DeepQ(Network(hidden=8), batch=8, buffer=64, warmup=32, target_every=16)
 GRID = TrapGrid(size=4, traps=((1, 2),), horizon=12)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import uard.envs  # noqa: F401  (registers ids)
-from uard import InvalidValueError, RatingLog, doctor, logs
-from uard.diagnosis import CODES, PRINTED, filtered
-from uard.mitigation import named
+from uard import InvalidValueError, RatingLog, doctor
+from uard.diagnosis.doctor import CODES, PRINTED, filtered
+from uard.method.mitigations import named
+from uard.ratings import readers as logs
 
 N = 200
 

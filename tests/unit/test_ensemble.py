@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from uard import InvalidValueError
-from uard.ensemble import RewardEnsemble
+from uard.adapters.reward_ensemble import RewardEnsemble
 
 BOX = gymnasium.spaces.Box(-1.0, 1.0, (2,))
 FOUR = gymnasium.spaces.Discrete(4)

@@ -5,20 +5,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uard import studies
 from uard.agents.continuous import edac, sunrise
+from uard.agents.networks import Ensemble, Network
 from uard.agents.policy import PPO
-from uard.envs.mujoco import Locomotion, Moved
-from uard.feedback.transitions import TransitionModel
-from uard.lab import examine, runner
+from uard.envs.locomotion.physics import Locomotion, Moved
+from uard.lab import studies
 from uard.lab.cell import Cell
-from uard.lab.store import Store
+from uard.lab.execution import examine, runner
+from uard.lab.execution.store import Store
 from uard.lab.study import Study, row
-from uard.mitigation import Raw, named
-from uard.networks import Ensemble, Network
-from uard.reporting import locomotion
-from uard.reporting.published import Published, extract
-from uard.training import host
+from uard.lab.views.published import Published, extract
+from uard.method.mitigations import Raw, named
+from uard.replication import locomotion
+from uard.training.feedback.transition_model import TransitionModel
+from uard.training.host import loop as host
 
 TINY = Network(16, 1e-3, 1.0)
 OFF = {"network": TINY, "batch": 32, "warmup": 64, "buffer": 500}

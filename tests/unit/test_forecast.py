@@ -4,11 +4,11 @@ import random
 import pytest
 
 from uard.agents.value import DeepQ
-from uard.envs.trapgrid import TrapGrid
+from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
-from uard.lab.forecast import Forecast
-from uard.lab.runner import batches, shape_of
-from uard.mitigation import named
+from uard.lab.execution.forecast import Forecast
+from uard.lab.execution.runner import batches, shape_of
+from uard.method.mitigations import named
 
 COMPILE = 3.0
 

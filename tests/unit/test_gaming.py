@@ -16,15 +16,16 @@ from gymnasium.utils.env_checker import check_env
 
 import uard.envs
 from uard import InvalidValueError, UnknownNameError
-from uard.envs import gym_gaming, panels
-from uard.envs.classic import Acrobot, CartPole
-from uard.envs.gaming import GARDEN, HOUSE, RING, TOMATOES, AbsentSupervisor, BoatRace, TomatoWatering
-from uard.envs.gaming_world import TomatoState
-from uard.envs.gym import Evaluation
-from uard.envs.gym_gaming import GamingEnv, absent_supervisor, boat_race, tomato_watering
-from uard.envs.tabular import Task
-from uard.envs.trapgrid import TrapGrid
+from uard.envs.classic.specs import Acrobot, CartPole
+from uard.envs.grids import gym_gaming
+from uard.envs.grids.gaming import GARDEN, HOUSE, RING, TOMATOES, AbsentSupervisor, BoatRace, TomatoWatering
+from uard.envs.grids.gym import Evaluation
+from uard.envs.grids.gym_gaming import GamingEnv, absent_supervisor, boat_race, tomato_watering
+from uard.envs.grids.tomato_world import TomatoState
+from uard.envs.grids.trapgrid import TrapGrid
+from uard.envs.tables import Task
 from uard.envs.world import TableWorld, World
+from uard.ratings import panels
 
 UP, DOWN, LEFT, RIGHT = range(4)
 LAP = [RIGHT, RIGHT, DOWN, DOWN, LEFT, LEFT, UP, UP]

@@ -5,7 +5,7 @@ from gymnasium.utils.env_checker import check_env
 
 import uard.envs  # noqa: F401 registers the ids
 from uard import InvalidValueError
-from uard.envs.gym_mujoco import REGISTERED
+from uard.envs.locomotion.gym import REGISTERED
 
 
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m..imum value is")
@@ -87,7 +87,7 @@ def test_every_id_can_be_made():
     ],
 )
 def test_bad_options(options, message):
-    from uard.envs.gym_mujoco import LocomotionEnv
+    from uard.envs.locomotion.gym import LocomotionEnv
 
     with pytest.raises(InvalidValueError, match=message):
         LocomotionEnv(**options)

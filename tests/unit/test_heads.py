@@ -8,7 +8,7 @@ from scipy import stats
 
 from uard.agents import heads
 from uard.agents.heads import GaussianPolicy, Normal
-from uard.networks import Network
+from uard.agents.networks import Network
 
 RANDOM = np.random.default_rng(0)
 SAID = {

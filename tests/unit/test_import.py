@@ -24,8 +24,8 @@ def test_import_is_fast():
     [
         "",
         "from uard import *",
-        "import uard.mitigation as m; m.named('uard')",
-        "import uard.calibration, uard.stability",
+        "import uard.method.mitigations as m; m.named('uard')",
+        "import uard.method.calibration, uard.method.stability",
     ],
 )
 def test_the_method_needs_nothing_heavy(use):

@@ -3,9 +3,11 @@ import numpy as np
 import pytest
 
 from uard.agents.tabular import QLearning
-from uard.envs.trapgrid import TrapGrid
-from uard.mitigation import named
-from uard.training import fused, lanes, xla
+from uard.envs.grids.trapgrid import TrapGrid
+from uard.method.mitigations import named
+from uard.training import xla
+from uard.training.compiled import runs as lanes
+from uard.training.compiled import tabular as fused
 
 PROGRAM = fused.Program(episodes=20)
 FIELDS = ("log", "steps", "q")

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from uard._checks import InvalidValueError
-from uard.envs.trapgrid import paper_grid
+from uard.envs.grids.trapgrid import paper_grid
 from uard.envs.world import TableWorld
-from uard.feedback import learned, running
-from uard.feedback.learned import Memory, Model, RatingModel
-from uard.mitigation import Feedback
+from uard.method.mitigations import Feedback
+from uard.training.feedback import rating_model as learned
+from uard.training.feedback import running
+from uard.training.feedback.rating_model import Memory, Model, RatingModel
 
 SLOTS = 7
 

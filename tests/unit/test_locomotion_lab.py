@@ -10,21 +10,23 @@ from PIL import Image
 
 from uard._checks import InvalidValueError
 from uard.agents.continuous import ensemble_sac
+from uard.agents.networks import Ensemble, Network
 from uard.agents.policy import PPO
 from uard.agents.tabular import QLearning
-from uard.envs.mujoco import Locomotion, Vibration
-from uard.envs.trapgrid import TrapGrid
-from uard.feedback.learned import RatingModel
-from uard.feedback.transitions import TransitionModel
-from uard.lab import names, runner
+from uard.envs.grids.trapgrid import TrapGrid
+from uard.envs.locomotion.physics import Locomotion, Vibration
+from uard.lab import registry as names
 from uard.lab.cell import RESULTS, Cell
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store
 from uard.lab.result import METRICS
-from uard.lab.store import Store
-from uard.mitigation import Raw, named
-from uard.networks import Ensemble, Network
-from uard.reporting import locomotion as shown
-from uard.reporting.published import Published, packaged_json
-from uard.studies import every, locomotion
+from uard.lab.studies import every
+from uard.lab.views.published import Published, packaged_json
+from uard.method.mitigations import Raw, named
+from uard.replication import locomotion as shown
+from uard.replication.studies import locomotion
+from uard.training.feedback.rating_model import RatingModel
+from uard.training.feedback.transition_model import TransitionModel
 
 TINY = PPO(Network(16, 1e-3, 100.0), Ensemble("shared", 3), envs=4, rollout=32, epochs=1, count_bonus=0.0)
 WHERE = Locomotion("hopper", region=Vibration(shaking=0.5, speed=5.0))

@@ -9,7 +9,8 @@ import pytest
 from pyarrow import parquet
 
 import uard.envs  # noqa: F401  (registers ids)
-from uard import InvalidValueError, RatingLog, logs
+from uard import InvalidValueError, RatingLog
+from uard.ratings import readers as logs
 
 NAMES = ("reward", "rating_ann", "rating_bob", "sigma_m", "true_reward", "episode", "other")
 ROWS = [

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-import uard.mitigation
+import uard.method.mitigations
 from uard import Evidence, Feedback, LearningSignal, Mitigation, ReliabilityFilter, RewardDiscounting
 from uard._checks import InvalidValueError, UnknownNameError
-from uard.mitigation import NAMED, RatedReward, Raw, Screening, Usual, as_column, measure_usual, named
-from uard.reliability import FORMS
-from uard.uncertainty import Spread
+from uard.method.mitigations import NAMED, RatedReward, Raw, Screening, Usual, as_column, measure_usual, named
+from uard.method.uncertainty import Spread
+from uard.method.weights import FORMS
 
 SIGMA_H = math.sqrt(14 / 9)  # of the ratings {-1, 2, 1}
 WITH_PROXY = math.sqrt(3.25)  # of {-1, 2, 1, 4}
@@ -269,6 +269,6 @@ def test_negative_uncertainty_is_refused():
 
 
 def test_docstring_examples_run():
-    result = doctest.testmod(uard.mitigation)
+    result = doctest.testmod(uard.method.mitigations)
     assert result.attempted > 0
     assert result.failed == 0

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from uard._checks import InvalidValueError, UnknownNameError
-from uard.envs import mujoco
-from uard.envs.mujoco import Kick, Locomotion, Motion, Physics, PhysicsError, Posture, Spikes, Vibration
+from uard.envs.locomotion import physics as mujoco
+from uard.envs.locomotion.physics import Kick, Locomotion, Motion, Physics, PhysicsError, Posture, Spikes, Vibration
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:gymnasium.envs.registration")
 NAMES = {"hopper": "Hopper", "walker2d": "Walker2d"}

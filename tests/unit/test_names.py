@@ -4,12 +4,12 @@ import pytest
 
 from uard import InvalidValueError
 from uard._checks import UnknownNameError
-from uard.abstention import Abstention
 from uard.agents.tabular import QLearning
-from uard.envs.trapgrid import PAPER_HORIZON, PAPER_TRAPS, TrapGrid
-from uard.lab import names
-from uard.lab.names import changed, settings
-from uard.mitigation import NAMED, RatedReward, RewardDiscounting, named
+from uard.envs.grids.trapgrid import PAPER_HORIZON, PAPER_TRAPS, TrapGrid
+from uard.lab import registry as names
+from uard.lab.registry import changed, settings
+from uard.method.abstention import Abstention
+from uard.method.mitigations import NAMED, RatedReward, RewardDiscounting, named
 
 
 @pytest.mark.parametrize(

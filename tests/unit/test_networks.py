@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from uard import networks
 from uard._checks import InvalidValueError
-from uard.networks import SINGLE, Ensemble, Network, Weights
+from uard.agents import networks
+from uard.agents.networks import SINGLE, Ensemble, Network, Weights
 
 NETWORK = Network(hidden=8, value_scale=5.0)
 FEATURES, ACTIONS, BATCH = 6, 3, 4

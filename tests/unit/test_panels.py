@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from uard import InvalidValueError, UnknownNameError
-from uard.envs.gym import TrapGridEnv
-from uard.envs.panels import PANELS, ratings
-from uard.envs.trapgrid import TrapGrid
+from uard.envs.grids.gym import TrapGridEnv
+from uard.envs.grids.trapgrid import TrapGrid
+from uard.ratings.panels import PANELS, ratings
 
 GRID = TrapGrid(size=6)
 TWIN = TrapGrid(size=6, legitimate=True)

@@ -16,17 +16,17 @@ from gymnasium import spaces
 from jax.flatten_util import ravel_pytree
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from uard import networks
 from uard._checks import InvalidValueError
-from uard.agents import policy
+from uard.agents import networks, policy
+from uard.agents.networks import Ensemble, Network
 from uard.agents.off_policy import Watched
 from uard.agents.policy import CPO, PPO, TRPO, Batch, Experience
-from uard.envs.tabular import HiddenTruth, Ratings, Task
+from uard.envs.tables import HiddenTruth, Ratings, Task
 from uard.envs.world import TableWorld
-from uard.mitigation import Evidence, named
-from uard.networks import Ensemble, Network
-from uard.training import deep, on_policy
-from uard.training.lanes import LOG
+from uard.method.mitigations import Evidence, named
+from uard.training.compiled import common as deep
+from uard.training.compiled import on_policy
+from uard.training.episode_log import LOG
 from uard.training.tracing import traceable
 
 FEATURES, ACTIONS, BATCH = 5, 3, 64

@@ -7,12 +7,12 @@ import torch
 
 from uard import ReliabilityFilter, discount, total_uncertainty
 from uard._checks import InvalidValueError, UnknownNameError
-from uard.reliability import (
+from uard.method.arrays import namespace
+from uard.method.weights import (
     FORMS,
     certainty_equivalent_weight,
     exponential_weight,
     linear_weight,
-    namespace,
     reciprocal_weight,
     wiener_weight,
 )

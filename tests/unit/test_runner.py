@@ -12,12 +12,12 @@ import pytest
 
 from uard import LearningSignal, Mitigation
 from uard.agents.tabular import QLearning
-from uard.envs.trapgrid import TrapGrid, paper_grid
-from uard.lab import runner
+from uard.envs.grids.trapgrid import TrapGrid, paper_grid
 from uard.lab.cell import Cell
-from uard.lab.runner import StudyFailedError, batches, run, shape_of, train_batch
-from uard.lab.store import Store
-from uard.mitigation import named
+from uard.lab.execution import runner
+from uard.lab.execution.runner import StudyFailedError, batches, run, shape_of, train_batch
+from uard.lab.execution.store import Store
+from uard.method.mitigations import named
 
 GRID = TrapGrid(size=4, traps=((1, 2),), horizon=8)
 USERS = """

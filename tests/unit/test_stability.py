@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from uard._checks import UnknownNameError
-from uard.stability import DEFINITIONS, perturbed_advantage, sign_preservation_radius
+from uard.method.stability import DEFINITIONS, perturbed_advantage, sign_preservation_radius
 
 WEIGHT = 0.445
 

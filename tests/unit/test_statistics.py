@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from uard import InvalidValueError, statistics
-from uard.statistics import (
+from uard import InvalidValueError
+from uard.lab import statistics
+from uard.lab.statistics import (
     bonferroni,
     hedges_g,
     holm,

@@ -7,11 +7,11 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from uard.envs.trapgrid import TrapGrid
-from uard.lab import runner
+from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store, StoreError
 from uard.lab.result import CorruptResultError, Result
-from uard.lab.store import Store, StoreError
 from uard.lab.study import results_of
 
 CELL, OTHER = Cell(episodes=3), Cell(episodes=4)
@@ -60,7 +60,7 @@ def corrupt(path, seed):
 def child(code, *arguments, **options):
     prelude = (
         "import sys, time, numpy as np\n"
-        "from uard.lab.cell import Cell\nfrom uard.lab.result import Result\nfrom uard.lab.store import Store\n"
+        "from uard.lab.cell import Cell\nfrom uard.lab.result import Result\nfrom uard.lab.execution.store import Store\n"
         "def result(seed): return Result(np.full((3, 6), seed + 1, np.float32), seed, np.zeros(2, np.int32), {})\n"
         "cell, store = Cell(episodes=3), Store(sys.argv[1])\n"
     )

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from uard import InvalidValueError
-from uard.abstention import Abstention
-from uard.mitigation import RatedReward, Raw, Screening, named, uard_paper
-from uard.stream import NeverRatedWarning, RewardStream
+from uard.method.abstention import Abstention
+from uard.method.mitigations import RatedReward, Raw, Screening, named, uard_paper
+from uard.ratings.stream import NeverRatedWarning, RewardStream
 
 TRAP = 4.0, (-1.0, 2.0, 1.0)
 HONEST = -0.1, (-0.1, -0.1, -0.1)

@@ -12,8 +12,8 @@ from gymnasium.utils.env_checker import check_env
 
 import uard.envs
 from uard import InvalidValueError, UnknownNameError
-from uard.envs.gym import REGISTERED, Evaluation, TrapGridEnv, register
-from uard.envs.trapgrid import TrapGrid, paper_grid
+from uard.envs.grids.gym import REGISTERED, Evaluation, TrapGridEnv, register
+from uard.envs.grids.trapgrid import TrapGrid, paper_grid
 
 UP, DOWN, LEFT, RIGHT = range(4)
 

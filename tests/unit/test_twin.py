@@ -10,9 +10,9 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from uard.envs.gym import TrapGridEnv
-from uard.envs.tabular import HiddenTruth, Task, pad, step
-from uard.envs.trapgrid import TrapGrid
+from uard.envs.grids.gym import TrapGridEnv
+from uard.envs.grids.trapgrid import TrapGrid
+from uard.envs.tables import HiddenTruth, Task, pad, step
 
 SIZES = range(2, 9)
 STATES = max(SIZES) ** 2

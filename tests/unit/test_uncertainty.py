@@ -8,7 +8,7 @@ import torch
 
 from uard import sigma_human, sigma_model
 from uard._checks import InvalidValueError
-from uard.uncertainty import OneAnnotatorWarning, ratings_from, shrink, spread, with_proxy
+from uard.method.uncertainty import OneAnnotatorWarning, ratings_from, shrink, spread, with_proxy
 
 RATINGS = np.array([[-1.0, 2.0, 1.0], [0.5, 0.5, 0.5], [3.0, -3.0, 0.0]])
 MASK = np.array([[True, True, True], [True, True, False], [True, False, True]])

@@ -12,10 +12,10 @@ import optax
 import pytest
 
 from uard._checks import InvalidValueError
+from uard.agents.networks import SINGLE, Ensemble, Network
 from uard.agents.off_policy import Batch, OffPolicy
 from uard.agents.value import DeepQ, State, backup_weight, conservative_gap
-from uard.mitigation import LearningSignal
-from uard.networks import SINGLE, Ensemble, Network
+from uard.method.mitigations import LearningSignal
 
 FEATURES, ACTIONS, SCALE, RATE = 5, 3, 4.0, 1e-2
 NETWORK = Network(hidden=8, learning_rate=RATE, value_scale=SCALE)

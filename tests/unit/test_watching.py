@@ -5,17 +5,17 @@ import numpy as np
 import pytest
 
 from uard import InvalidValueError
-from uard.envs.trapgrid import TrapGrid
-from uard.lab import runner
+from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
-from uard.lab.claims import Owner
+from uard.lab.execution import runner
+from uard.lab.execution.claims import Owner
+from uard.lab.execution.store import Store
 from uard.lab.result import METRICS
-from uard.lab.store import Store
 from uard.lab.study import Study, row
-from uard.mitigation import named
-from uard.reporting.status import duration, lines, status, titles
-from uard.reporting.tensorboard import POINTS, Events
-from uard.training.lanes import LOG
+from uard.lab.views.status import duration, lines, status, titles
+from uard.lab.views.tensorboard import POINTS, Events
+from uard.method.mitigations import named
+from uard.training.episode_log import LOG
 
 GRID = TrapGrid(size=4, traps=((1, 2),), horizon=8)
 STUDY = Study("small", "Small", "", tuple(row(Cell(GRID, named("raw"), episodes=n), episodes=n) for n in (5, 1500)))

@@ -11,8 +11,8 @@ import numpy as np
 
 from uard import InvalidValueError, LearningSignal, Mitigation
 from uard.agents.value import DeepQ
-from uard.envs import panels
-from uard.envs.tabular import HiddenTruth, Ratings, Task
+from uard.envs.tables import HiddenTruth, Ratings, Task
+from uard.ratings import panels
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,10 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from uard.abstention import Abstention
 from uard.adapters.steps import INFO, Doubt, Key, Ratings, Steps, natural_key, rows_of, subset
-from uard.mitigation import Mitigation
-from uard.stream import RewardStream
+from uard.method.abstention import Abstention
+from uard.method.mitigations import Mitigation
+from uard.ratings.stream import RewardStream
 
 
 def _steps(
@@ -73,7 +73,7 @@ class ReliabilityWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.
                 no ``ratings``; a step without is a step that nobody rated.
             mitigation: What to do with rewards; ``uard()`` if left out.
             ratings: Called with batches (observations, actions, next observations, rewards), B = 1 here.
-            sigma_m: Called with batches (observations, actions); e.g. ``uard.ensemble.RewardEnsemble``.
+            sigma_m: Called with batches (observations, actions); e.g. ``uard.adapters.reward_ensemble.RewardEnsemble``.
             key: Tells state-actions apart, so that what was said of one is remembered when it comes again; found for
                 numbered states and actions if left out.
             abstention: Marks steps in ``info["abstained"]``.

@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 
 from uard import _checks
-from uard.abstention import Abstention
 from uard.adapters.steps import INFO, Doubt, Key, Ratings, Steps, natural_key, rows_of
-from uard.mitigation import Mitigation
-from uard.stream import Filtered, RewardStream
+from uard.method.abstention import Abstention
+from uard.method.mitigations import Mitigation
+from uard.ratings.stream import Filtered, RewardStream
 
 try:
     from stable_baselines3.common.buffers import ReplayBuffer

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 
 from uard import _checks
-from uard.stream import Filtered, RewardStream
+from uard.ratings.stream import Filtered, RewardStream
 
 Ratings = Callable[[Any, Any, Any, np.ndarray], Any]
 """(observations, actions, next observations, observed rewards), all (B, ...) -> ratings (B, K), NaN where missing."""

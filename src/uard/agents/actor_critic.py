@@ -20,9 +20,10 @@ import jax.numpy as jnp
 import optax
 from jax import Array, lax
 
-from uard import _checks, networks
+from uard import _checks
+from uard.agents import networks
+from uard.agents.networks import Ensemble, Layer, Network, Weights
 from uard.agents.off_policy import Backup, Batch, Judge, Prefer, Watched
-from uard.networks import Ensemble, Layer, Network, Weights
 
 LOG_TEMPERATURES = (-10.0, 3.0)  # beyond them Adam would only wind up
 

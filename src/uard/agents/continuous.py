@@ -22,12 +22,13 @@ import jax.numpy as jnp
 import optax
 from jax import Array, lax
 
-from uard import _checks, networks
+from uard import _checks
+from uard.agents import networks
 from uard.agents.actor_critic import LOG_TEMPERATURES, Trained, gradient_similarity, polyak, temperature_loss
 from uard.agents.heads import HALF_LOG_TAU, Normal
+from uard.agents.networks import Ensemble, Layer, Network, Weights
 from uard.agents.off_policy import Judge, Watched
 from uard.agents.value import backup_weight
-from uard.networks import Ensemble, Layer, Network, Weights
 
 LOG_DEVIATIONS = (-5.0, 2.0)
 CQL_ACTIONS = 4  # drawn from the policy, and as many uniformly

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from uard import networks
-from uard.networks import Layer, Network
+from uard.agents import networks
+from uard.agents.networks import Layer, Network
 
 HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
 

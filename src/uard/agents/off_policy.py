@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 from jax import Array
 
-from uard.networks import Network
+from uard.agents.networks import Network
 
 Backup = Literal["greedy", "consistent"]  # which value the target takes: the best, or that of the best score
 

@@ -20,11 +20,11 @@ import optax
 from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 
-from uard import _checks, networks
-from uard.agents import heads
+from uard import _checks
+from uard.agents import heads, networks
 from uard.agents.heads import Said, divergence, entropy, log_probability
+from uard.agents.networks import SINGLE, Ensemble, Layer, Network, Weights
 from uard.agents.off_policy import Watched
-from uard.networks import SINGLE, Ensemble, Layer, Network, Weights
 
 Layers = tuple[Layer, ...]
 

@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from uard import _checks, uncertainty
-from uard.abstention import Abstention
+from uard import _checks
+from uard.method import uncertainty
+from uard.method.abstention import Abstention
 
 
 @dataclass(frozen=True)

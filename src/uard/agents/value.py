@@ -19,9 +19,10 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from uard import _checks, networks
+from uard import _checks
+from uard.agents import networks
+from uard.agents.networks import SINGLE, Ensemble, Network, Weights
 from uard.agents.off_policy import Backup, Batch, Judge, Prefer, Watched
-from uard.networks import SINGLE, Ensemble, Network, Weights
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from uard.envs.tabular import MIN_STATES, HiddenTruth, Ratings, Task, pad
+from uard.envs.tables import MIN_STATES, HiddenTruth, Ratings, Task, pad
 
 
 class Step(NamedTuple):

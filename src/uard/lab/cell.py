@@ -13,14 +13,14 @@ import numpy as np
 
 from uard import _checks
 from uard.agents.tabular import QLearning
-from uard.envs.mujoco import Locomotion
-from uard.envs.panels import PANELS
-from uard.envs.spec import Spec
-from uard.envs.trapgrid import TrapGrid
-from uard.feedback.learned import RatingModel
-from uard.feedback.transitions import QUERIES, TransitionModel
-from uard.lab import names
-from uard.mitigation import Mitigation, Raw
+from uard.envs.base import Spec
+from uard.envs.grids.trapgrid import TrapGrid
+from uard.envs.locomotion.physics import Locomotion
+from uard.lab import registry as names
+from uard.method.mitigations import Mitigation, Raw
+from uard.ratings.panels import PANELS
+from uard.training.feedback.rating_model import RatingModel
+from uard.training.feedback.transition_model import QUERIES, TransitionModel
 
 # Raise this when training code changes what a cell means: old results are then not found, never mixed in.
 RESULTS = 2
@@ -33,7 +33,7 @@ class Cell:
     """One environment, panel, agent and mitigation, trained for some episodes.
 
     Attributes:
-        environment: Where it learns: an ``uard.envs.spec.Spec``, or a ``Locomotion``.
+        environment: Where it learns: an ``uard.envs.base.Spec``, or a ``Locomotion``.
         mitigation: What the agent does about a reward that may lie.
         agent: The learner.
         panel: Who rates. Irrelevant, and therefore ignored, for a mitigation that reads no ratings.

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from uard import statistics
-from uard.training.lanes import LOG
+from uard.lab import statistics
+from uard.training.episode_log import LOG
 
 WINDOW = 100  # metrics are per episode over the last 100 episodes, as the paper's
 METRICS = (

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from uard.lab.cell import Cell
+from uard.lab.execution.store import Store
 from uard.lab.result import Result
-from uard.lab.store import Store
 
 
 @dataclass(frozen=True)

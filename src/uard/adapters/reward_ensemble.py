@@ -1,0 +1,105 @@
+"""An ensemble that needs nothing but NumPy: sigma_m for training that has no ensemble of its own.
+
+Each member is a ridge regression of the observed reward on random Fourier features [Rahimi and Recht 2007] of state
+and action, fitted to its own bootstrap of the steps (each step counts 0, 1, 2 ... times, Poisson) and added to its own
+fixed random function, so that members disagree where nothing was seen [Osband et al. 2018].
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from uard import _checks
+from uard.method import uncertainty
+
+BOUND = 10.0  # coordinates without finite bounds are cut off here
+
+
+class RewardEnsemble:
+    """Predicts the observed reward of state-actions; members disagree where they have seen little. Changed in place."""
+
+    def __init__(
+        self,
+        observation_space: gymnasium.Space[Any],
+        action_space: gymnasium.Space[Any],
+        *,
+        members: int = 5,
+        features: int = 64,
+        ridge: float = 1.0,
+        prior_scale: float = 1.0,
+        seed: int = 0,
+    ):
+        """Start without having seen anything.
+
+        Args:
+            observation_space: Of one environment.
+            action_space: Of one environment.
+            members: N >= 2.
+            features: Random features of each member, >= 1.
+            ridge: Penalty > 0, in steps: how many it takes before data outweigh the prior.
+            prior_scale: Deviation of the fixed random functions, in reward units, > 0.
+            seed: Of the features, the priors and the bootstrap.
+        """
+        _checks.whole("members", members, low=2, high=64)
+        _checks.whole("features", features, low=1, high=4096)
+        _checks.number("ridge", ridge, low=0, open_low=True)
+        _checks.number("prior_scale", prior_scale, low=0, open_low=True)
+        self._spaces = observation_space, action_space
+        self._random = np.random.default_rng(seed)
+        width = sum(gymnasium.spaces.flatdim(space) for space in self._spaces)
+        self._directions = self._random.normal(0.0, 1.0 / np.sqrt(width), (members, width, features))
+        self._phases = self._random.uniform(0.0, 2.0 * np.pi, (members, 1, features))
+        self._prior = self._random.normal(0.0, prior_scale, (members, features))
+        self._gram = np.tile(ridge * np.eye(features), (members, 1, 1))
+        self._moment = np.zeros((members, features))
+        self._weights = np.zeros((members, features))
+        self._seen, self._due = 0, 1
+
+    def __call__(self, observations: Any, actions: Any) -> np.ndarray:
+        """Return sigma_m (B,) of a batch of state-actions, in reward units."""
+        return uncertainty.sigma_model(self.predict(observations, actions), axis=0)
+
+    def predict(self, observations: Any, actions: Any) -> np.ndarray:
+        """Return every member's estimate, (N, B)."""
+        return np.einsum("nbf,nf->nb", self._features(observations, actions), self._prior + self._weights)
+
+    def update(self, observations: Any, actions: Any, rewards: Any) -> None:
+        """Learn from a batch of steps; members are solved anew after 1, 2, 4 ... 256, 512, 768 ... steps."""
+        z = self._features(observations, actions)
+        often = self._random.poisson(1.0, z.shape[:2]).astype(float)
+        left = rewards - np.einsum("nbf,nf->nb", z, self._prior)
+        heavy = often[..., None] * z
+        self._gram += np.einsum("nbf,nbg->nfg", heavy, z)
+        self._moment += np.einsum("nbf,nb->nf", heavy, left)
+        self._seen += len(rewards)
+        if self._seen >= self._due:
+            self._due = self._seen + min(self._seen, 256)
+            self._weights = np.linalg.solve(self._gram, self._moment[..., None])[..., 0]
+
+    def _features(self, observations: Any, actions: Any) -> np.ndarray:
+        flat = np.concatenate([_flat(s, x) for s, x in zip(self._spaces, (observations, actions), strict=True)], axis=1)
+        projected = np.einsum("bw,nwf->nbf", flat, self._directions) * np.sqrt(flat.shape[1])
+        return np.cos(projected + self._phases) * np.sqrt(2.0 / self._phases.shape[-1])
+
+
+def _flat(space: gymnasium.Space[Any], batch: Any) -> np.ndarray:
+    """Return a batch as (B, width) numbers of size about one."""
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return np.eye(int(space.n))[np.asarray(batch).reshape(-1) - int(space.start)]
+    if isinstance(space, gymnasium.spaces.Box):
+        flat = np.asarray(batch, float).reshape(len(batch), -1)
+        low, high = space.low.ravel().astype(float), space.high.ravel().astype(float)
+        bounded = np.isfinite(low) & np.isfinite(high)
+        middle, half = np.where(bounded, (low + high) / 2, 0.0), np.where(bounded, (high - low) / 2, 1.0)
+        return np.clip((flat - middle) / np.where(half > 0, half, 1.0), -BOUND, BOUND)
+    rows = gymnasium.vector.utils.iterate(gymnasium.vector.utils.batch_space(space, _length(batch)), batch)
+    return np.array([gymnasium.spaces.flatten(space, row) for row in rows], float)
+
+
+def _length(batch: Any) -> int:
+    while isinstance(batch, dict | tuple):
+        batch = next(iter(batch.values())) if isinstance(batch, dict) else batch[0]
+    return len(batch)

@@ -1,0 +1,52 @@
+"""The filter as a reward function of TRL's GRPO and RLOO trainers.
+
+The callback and its warnings are loaded on first use: they alone need transformers.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from uard.adapters.trl.reward import (
+    Judged,
+    RewardModel,
+    UncertaintyDiscountedReward,
+    UnscoredWarning,
+    advantage_change,
+    groups_of,
+    keeps_factor,
+)
+from uard.judges.asking import JudgeError
+
+if TYPE_CHECKING:
+    from uard.adapters.trl.callback import (
+        DiscountCancelledWarning,
+        ForgottenWarning,
+        ReliabilityCallback,
+        UselessJudgeWarning,
+    )
+
+_OF_CALLBACK = ("DiscountCancelledWarning", "ForgottenWarning", "ReliabilityCallback", "UselessJudgeWarning")
+
+__all__ = [
+    "DiscountCancelledWarning",
+    "ForgottenWarning",
+    "JudgeError",
+    "Judged",
+    "ReliabilityCallback",
+    "RewardModel",
+    "UncertaintyDiscountedReward",
+    "UnscoredWarning",
+    "UselessJudgeWarning",
+    "advantage_change",
+    "groups_of",
+    "keeps_factor",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _OF_CALLBACK:
+        from uard.adapters.trl import callback
+
+        return getattr(callback, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

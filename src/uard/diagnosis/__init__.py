@@ -1,0 +1,1 @@
+"""The doctor: which known traps a log of rewards and ratings is in."""

@@ -1,0 +1,1 @@
+"""CartPole and Acrobot: problems without a lie."""

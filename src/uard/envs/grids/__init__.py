@@ -1,0 +1,1 @@
+"""Small worlds of numbered cells: TrapGrid, the reward-gaming gridworlds, a learned reward."""

@@ -1,0 +1,1 @@
+"""Robots on MuJoCo that are to run forward, and how their reward lies."""

@@ -1,0 +1,1 @@
+"""Judges: several reward functions or reward models, asked together and brought to one scale."""

@@ -1,0 +1,1 @@
+"""How cells become stored results: batches, workers, clusters, the store."""

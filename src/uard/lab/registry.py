@@ -1,0 +1,269 @@
+"""Names that the command line and studies use, and how ``--set`` changes what they stand for."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from typing import Any
+
+from uard import _checks, plugins
+from uard.agents import continuous
+from uard.agents.actor_critic import SoftActorCritic, edac
+from uard.agents.continuous import ContinuousActorCritic
+from uard.agents.networks import Ensemble, Network
+from uard.agents.off_policy import OffPolicy
+from uard.agents.policy import CPO, PPO, TRPO, PolicyGradient
+from uard.agents.tabular import QLearning
+from uard.agents.value import DeepQ
+from uard.envs.base import Spec, Tables
+from uard.envs.classic.specs import Acrobot, CartPole
+from uard.envs.grids.gaming import AbsentSupervisor, BoatRace, TomatoWatering
+from uard.envs.grids.trapgrid import TrapGrid
+from uard.envs.locomotion.physics import Locomotion, Posture, Vibration
+from uard.method import mitigations as mitigation
+from uard.method.abstention import Abstention
+from uard.method.mitigations import Mitigation
+from uard.ratings.panels import PANELS
+from uard.training.feedback.rating_model import RatingModel
+
+ENVIRONMENTS: dict[str, Any] = {
+    "TrapGrid": TrapGrid(),
+    **{f"TrapGrid{n}": TrapGrid(size=n) for n in (6, 8, 10)},
+    **{f"TrapGrid{n}-Trap8": TrapGrid(size=n, trap_reward=8.0) for n in (6, 8, 10)},
+    **{f"TrapGrid{n}-Legitimate": TrapGrid(size=n, legitimate=True) for n in (6, 8, 10)},
+    "TrapGrid10-T100": TrapGrid(size=10, horizon=100),
+    **{
+        f"{spec.__name__}{suffix}": spec(legitimate=bool(suffix))
+        for spec in (BoatRace, TomatoWatering, AbsentSupervisor)
+        for suffix in ("", "-Legitimate")
+    },
+    **{
+        f"{name}-{region.__name__}{suffix}": Locomotion(robot, region=region(), legitimate=bool(suffix))
+        for name, robot in (("Hopper", "hopper"), ("Walker2d", "walker2d"))
+        for region in (Vibration, Posture)
+        for suffix in ("", "-Legitimate")
+    },
+    "Hopper": Locomotion("hopper", region=None),
+    "Walker2d": Locomotion("walker2d", region=None),
+    "CartPole": CartPole(),
+    "Acrobot": Acrobot(),
+}
+
+
+def deep_agents(network: Network | None = None) -> dict[str, Any]:
+    """Return the paper's deep baselines (D4-D12) by name, with one network for all of them (J35).
+
+    Ensemble members where the paper has them; others have what the algorithm itself needs.
+    """
+    net = network or Network()
+    five = Ensemble("shared", 5)
+    return {
+        "dqn": DeepQ(net),
+        "ensemble-dqn": DeepQ(net, five),
+        "cql": DeepQ(net, conservative=1.0),
+        "sunrise": DeepQ(net, five, ucb=1.0, temperature=10.0),
+        "ppo": PPO(net),
+        "trpo": TRPO(net),
+        "cpo": CPO(net, oracle=False),
+        "cpo-oracle": CPO(net),
+        "sac": SoftActorCritic(net),
+        "edac": edac(network=net),
+    }
+
+
+def continuous_agents(small: bool = False) -> dict[str, Any]:
+    """Return the agents for continuous actions by name, with one network for all of a family (J35).
+
+    Args:
+        small: 64 units and batches of 128 for the actor-critic family, for a CPU; else 256 and 256.
+    """
+    one = Network(64, 3e-4, 100.0, "tanh")  # values are as large as 1 / (1 - gamma)
+    shared: dict[str, Any] = {"gamma": 0.99, "rollout": 256, "epochs": 10, "minibatches": 32, "count_bonus": 0.0}
+    critic: dict[str, Any] = {"network": Network(256, 3e-4, 1.0)}
+    if small:
+        critic = {"network": Network(64, 1e-3, 1.0), "batch": 128, "warmup": 2_000}
+    return {
+        "ppo": PPO(one, entropy=0.0, **shared),
+        "trpo": TRPO(one, **shared),
+        "cpo": CPO(one, oracle=False, **shared),
+        "cpo-oracle": CPO(one, **shared),
+        "sac": continuous.sac(**critic),
+        "ensemble-sac": continuous.ensemble_sac(**critic),
+        "cql": continuous.cql(**critic),
+        "edac": continuous.edac(**critic),
+        "sunrise": continuous.sunrise(**critic),
+    }
+
+
+Agent = QLearning | OffPolicy | PolicyGradient | ContinuousActorCritic
+CONTINUOUS: dict[str, Any] = continuous_agents()
+AGENTS: dict[str, Agent] = {
+    "q-learning": QLearning(),
+    "random-walk": QLearning(1, 0.1, 0.95, 1.0, 1.0, 1.0),
+    **deep_agents(),
+}
+
+
+def can_work(agent: Any, environment: Any) -> bool:
+    """Whether an agent can work in an environment: tables need one that fits into them, motors a continuous agent."""
+    if isinstance(environment, Locomotion):
+        return isinstance(agent, PolicyGradient | ContinuousActorCritic)
+    if isinstance(agent, ContinuousActorCritic):
+        return False
+    return isinstance(environment, Tables) or not isinstance(agent, QLearning)
+
+
+def check_pair(agent: Any, environment: Any) -> None:
+    """Refuse an agent that cannot work in an environment.
+
+    Raises:
+        InvalidValueError: with the names of those that can.
+    """
+    if not can_work(agent, environment):
+        able = ", ".join(name for name, other in agents(environment).items() if can_work(other, environment))
+        if isinstance(environment, Locomotion):
+            why = "whose actions are continuous"
+        elif isinstance(agent, ContinuousActorCritic):
+            why = "whose actions are discrete"
+        else:
+            why = "which does not fit into tables"
+        raise _checks.InvalidValueError(
+            "agent", agent, f"one that can work in {type(environment).__name__}, {why}: {able}"
+        )
+
+
+def agents(environment: Any) -> dict[str, Any]:
+    """Return the agents by name, as they are for an environment."""
+    return CONTINUOUS if isinstance(environment, Locomotion) else AGENTS
+
+
+OWN: dict[str, tuple[str, ...]] = {
+    "environment": (*ENVIRONMENTS,),
+    "agent": (*dict.fromkeys((*AGENTS, *CONTINUOUS)),),
+    "mitigation": (*mitigation.NAMED,),
+}
+IS_ONE: dict[str, Callable[[Any], bool]] = {
+    "environment": lambda value: isinstance(value, Spec | Locomotion),
+    "agent": lambda value: isinstance(value, Agent),
+    "mitigation": mitigation.is_mitigation,
+}
+
+
+def brought(kind: str) -> tuple[dict[plugins.Plugin, Any], list[plugins.PluginError]]:
+    """Return what other packages bring of a kind ("environment", "agent", "mitigation"), and what of it is broken."""
+    good: dict[plugins.Plugin, Any] = {}
+    bad = plugins.clashes(kind, OWN[kind])
+    for plugin in plugins.usable(kind, OWN[kind]).values():
+        try:
+            good[plugin] = plugin.load(IS_ONE[kind])()
+        except plugins.PluginError as error:
+            bad.append(error)
+    return good, bad
+
+
+def _of(kind: str, name: str, ours: dict[str, Any]) -> Any:
+    if name in ours:
+        return ours[name]
+    return plugins.pick(kind, name, OWN[kind], [*ours]).load(IS_ONE[kind])()
+
+
+def settings(pairs: tuple[str, ...], option: str = "--set") -> dict[str, Any]:
+    """Read ``name=value`` pairs; values are JSON, or else text.
+
+    Raises:
+        InvalidValueError: a pair without ``=``.
+    """
+    out: dict[str, Any] = {}
+    for pair in pairs:
+        name, sign, value = pair.partition("=")
+        if not sign or not name:
+            raise _checks.InvalidValueError(option, pair, "name=value, such as size=12 or 'traps=[[2,5],[7,3]]'")
+        try:
+            out[name] = json.loads(value)
+        except json.JSONDecodeError:
+            out[name] = value
+    return out
+
+
+def changed(base: Any, changes: dict[str, Any], what: str) -> Any:
+    """Return a frozen dataclass with some fields changed; nested ones by dotted names.
+
+    Raises:
+        UnknownNameError: an unknown field, with the nearest known one.
+    """
+    fields = {f.name: f for f in dataclasses.fields(base) if f.init}
+    given: dict[str, Any] = {}
+    for name, value in changes.items():
+        head, _, rest = name.partition(".")
+        if head not in fields:
+            raise _checks.UnknownNameError(f"{what} setting", name, fields)
+        old = given.get(head, getattr(base, head))
+        parts = [f"{head}.{f.name}" for f in dataclasses.fields(old)] if dataclasses.is_dataclass(old) else []
+        if bool(rest) != bool(parts):
+            raise _checks.InvalidValueError(f"{what} setting", name, f"one of {', '.join(parts)}" if parts else head)
+        if rest:
+            value = changed(old, {rest: value}, f"{what}.{head}")
+        elif isinstance(old, bool) and not isinstance(value, bool):
+            raise _checks.InvalidValueError(f"{what} setting {name}", value, "true or false")
+        elif isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        elif isinstance(value, list):
+            value = tuple(tuple(v) if isinstance(v, list) else v for v in value)
+        given[head] = value
+    return dataclasses.replace(base, **given)
+
+
+def environment(name: str, changes: dict[str, Any]) -> Any:
+    """Return an environment by name. A new size, unless more is said, brings its own traps, goal and horizon."""
+    base = _of("environment", name, ENVIRONMENTS)
+    if isinstance(base, TrapGrid) and changes.get("size", base.size) != base.size:
+        base = TrapGrid(trap_reward=base.trap_reward, legitimate=base.legitimate)
+        base = _bare(base)
+    return changed(base, changes, "environment")
+
+
+def _bare(grid: TrapGrid) -> TrapGrid:
+    """Undo what the constructor filled in from the size."""
+    copy = object.__new__(TrapGrid)
+    for f in dataclasses.fields(TrapGrid):
+        keep = f.name not in ("traps", "goal", "horizon", "size")
+        object.__setattr__(copy, f.name, getattr(grid, f.name) if keep else f.default)
+    return copy
+
+
+def agent(name: str, changes: dict[str, Any], environment: Any = None) -> Agent:
+    """Return an agent by name, as it is for an environment, some fields changed.
+
+    ``abstention.rule`` and the like make a tabular one abstain.
+    """
+    base = _of("agent", name, agents(environment))
+    if isinstance(base, QLearning) and any(field.partition(".")[0] == "abstention" for field in changes):
+        base = dataclasses.replace(base, abstention=Abstention())
+    return changed(base, changes, "agent")
+
+
+def feedback(name: str | None, of: Agent, environment: Any = None) -> RatingModel | None:
+    """Return how an agent knows of ratings: ``model`` (a deep agent's default) or ``table`` (a tabular one's)."""
+    if isinstance(environment, Locomotion):
+        if name not in (None, "model"):
+            raise _checks.InvalidValueError("feedback", name, "model, or left out: no step comes twice")
+        return None
+    if name is None:
+        return None if isinstance(of, QLearning) else RatingModel()
+    return RatingModel() if _checks.choose("feedback", name, ("model", "table")) == "model" else None
+
+
+def mitigation_named(name: str, changes: dict[str, Any]) -> Mitigation:
+    """Return a mitigation by name, some fields changed (``filter.lam`` and the like for the filter's)."""
+    base: Any = mitigation.named(name)
+    short = {f.name for f in dataclasses.fields(base.filter)} if hasattr(base, "filter") else set()
+    known = short | {f.name for f in dataclasses.fields(base)}
+    for setting in changes:
+        _checks.choose("mitigation setting", setting.partition(".")[0], known)
+    return changed(base, {f"filter.{k}" if k in short else k: v for k, v in changes.items()}, "mitigation")
+
+
+def panel(name: str) -> str:
+    """Return a panel's name if there is one."""
+    return _checks.choose("panel", name, PANELS)

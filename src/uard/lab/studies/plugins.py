@@ -1,0 +1,103 @@
+"""What installed packages bring (``uard.plugins``), in studies: a study of their own, and their mitigations in ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import fields, replace
+from typing import Any
+
+from uard import _checks
+from uard.agents.tabular import QLearning
+from uard.envs.grids.trapgrid import paper_grid
+from uard.envs.locomotion.physics import Locomotion
+from uard.lab import registry as names
+from uard.lab.cell import Cell
+from uard.lab.studies.grids import COMPARED
+from uard.lab.study import Row, Study, row
+from uard.method.mitigations import named
+from uard.replication.studies.grids import PANELS
+from uard.replication.studies.locomotion import STANDARD
+from uard.training.feedback.rating_model import RatingModel
+
+AGENTS = ("q-learning", "ensemble-dqn", "ppo")  # the first that can work in an environment learns there
+
+
+def brought() -> tuple[Study, ...]:
+    """Return a study of what packages bring, every mitigation and panel and the twins; none if they bring nothing."""
+    rows = (*environments(), *agents())
+    if not rows:
+        return ()
+    return (Study("own", "What installed packages bring, every mitigation", "plugins", rows),)
+
+
+def mitigations() -> tuple[str, ...]:
+    """Return ours that are compared, and those of installed packages."""
+    return (*COMPARED, *(plugin.name for plugin in names.brought("mitigation")[0]))
+
+
+def environments() -> tuple[Row, ...]:
+    """Every environment of a package, and its legitimate twin if it has a field of that name."""
+    rows: list[Row] = []
+    for plugin, environment in names.brought("environment")[0].items():
+        able = names.agents(environment)
+        name = next(a for a in AGENTS if a in able and names.can_work(able[a], environment))
+        rows += _crossed(plugin.name, environment, name, able[name], (*PANELS, "colluding"))
+        if "legitimate" in {f.name for f in fields(environment)}:
+            twin = replace(environment, legitimate=True)
+            rows += _crossed(f"{plugin.name}, legitimate", twin, name, able[name], PANELS)
+    return tuple(rows)
+
+
+def agents() -> tuple[Row, ...]:
+    """Every agent of a package, on 6x6 and its twin, or on Hopper if its actions are continuous."""
+    rows: list[Row] = []
+    for plugin, agent in names.brought("agent")[0].items():
+        name, grid = "TrapGrid6", paper_grid(6)
+        if not names.can_work(agent, grid):
+            name, grid = "Hopper-Vibration", Locomotion()
+        rows += _crossed(name, grid, plugin.name, agent, (*PANELS, "colluding"))
+        rows += _crossed(f"{name}, legitimate", replace(grid, legitimate=True), plugin.name, agent, PANELS)
+    return tuple(rows)
+
+
+def _crossed(where: str, environment: Any, name: str, agent: Any, panels: tuple[str, ...]) -> list[Row]:
+    physical = isinstance(environment, Locomotion)
+    feedback = None if physical or isinstance(agent, QLearning) else RatingModel()
+    steps = STANDARD.steps if physical else None
+    return [
+        row(
+            Cell(environment, named(mitigation), agent, panel, feedback=feedback, steps=steps),
+            environment=where,
+            agent=name,
+            mitigation=mitigation,
+            panel=panel,
+        )
+        for panel in panels
+        for mitigation in mitigations()
+    ]
+
+
+def compared_with(studies: Iterable[Study], others: Iterable[str]) -> tuple[Study, ...]:
+    """Add mitigations to all studies that compare some: beside each row of ``uard``, one for each of the others.
+
+    Raises:
+        InvalidValueError: none of the studies compares mitigations, or a name is no mitigation.
+    """
+    studies, added = tuple(studies), {name: named(name) for name in dict.fromkeys(others)}
+    recommended, grown = named("uard"), []
+    for study in studies:
+        places = [r for r in study.where(mitigation="uard") if r.cell.mitigation == recommended]
+        new = [_instead(r, name, r.cell.with_(mitigation=m)) for name, m in added.items() for r in places]
+        have = {r.labels for r in study.rows}
+        grown.append(replace(study, rows=(*study.rows, *(r for r in new if r.labels not in have))))
+    if added and not any(any(s.where(mitigation="uard")) for s in studies):
+        allowed = f"left out: none of {', '.join(s.name for s in studies)} compares mitigations"
+        raise _checks.InvalidValueError("mitigation", ", ".join(added), allowed)
+    return tuple(grown)
+
+
+def _instead(of: Row, name: str, cell: Cell) -> Row:
+    labels = dict(of.labels) | {"mitigation": name}
+    if "sources" in labels:
+        labels["sources"] = "-"  # as with our rivals: the label tells forms of uard apart
+    return Row(tuple(labels.items()), cell)

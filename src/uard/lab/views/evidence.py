@@ -1,0 +1,72 @@
+"""What the store says: metrics of cells and of studies' rows, read once each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from uard.lab import statistics
+from uard.lab.cell import Cell
+from uard.lab.execution.store import Store
+from uard.lab.result import Result
+from uard.lab.study import Row, Study, metrics_of, results_of
+
+
+class Evidence:
+    """Finished studies over some seeds.
+
+    Attributes:
+        seeds: The seeds, in order.
+        studies: By name.
+    """
+
+    def __init__(self, store: Store, seeds: Sequence[int], studies: Sequence[Study]):
+        """Read from ``store`` as asked."""
+        self.store, self.seeds = store, tuple(seeds)
+        self.studies = {s.name: s for s in studies}
+        self._metrics: dict[Cell, list[dict[str, float]]] = {}
+        self._summaries: dict[tuple[Cell, str], statistics.Summary] = {}
+
+    def results(self, cell: Cell) -> list[Result]:
+        """Return all seeds of a cell (not kept in memory)."""
+        return results_of(cell, self.store, self.seeds)
+
+    def values(self, cell: Cell, metric: str) -> np.ndarray:
+        """Return one metric, one number per seed."""
+        if cell not in self._metrics:
+            self._metrics[cell] = metrics_of(cell, self.store, self.seeds)
+        return np.array([m[metric] for m in self._metrics[cell]])
+
+    def of(self, cell: Cell, metric: str) -> statistics.Summary:
+        """Return one metric's summary."""
+        key = cell, metric
+        if key not in self._summaries:
+            self._summaries[key] = statistics.summarise(self.values(cell, metric), metric)
+        return self._summaries[key]
+
+    def moments(self, cell: Cell, metric: str) -> tuple[float, float]:
+        """Return mean and sd of one metric as its summary does, but at once: no interval is resampled."""
+        values = self.values(cell, metric)
+        return float(values.mean()), float(values.std(ddof=1)) if values.size > 1 else 0.0
+
+    def row(self, study: str, **labels: Any) -> Row:
+        """Return the only row of a study with these labels."""
+        return self.studies[study].one(**labels)
+
+    def get(self, study: str, metric: str, **labels: Any) -> statistics.Summary:
+        """Return the summary of one row of a study."""
+        return self.of(self.row(study, **labels).cell, metric)
+
+    def per_seed(self, study: str, metric: str, **labels: Any) -> np.ndarray:
+        """Return the values of one row of a study, one per seed."""
+        return self.values(self.row(study, **labels).cell, metric)
+
+    def curves(self, study: str, column: str, **labels: Any) -> np.ndarray:
+        """Return a per-episode column, (seeds, episodes)."""
+        return np.stack([r.curve(column) for r in self.results(self.row(study, **labels).cell)])
+
+    def window(self, study: str, column: str, first: int, last: int, **labels: Any) -> statistics.Summary:
+        """Return a column's mean over episodes first..last (1-based, inclusive), summarised over seeds."""
+        return statistics.summarise(self.curves(study, column, **labels)[:, first - 1 : last].mean(1), column)

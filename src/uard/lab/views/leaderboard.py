@@ -1,0 +1,310 @@
+"""The leaderboard: mitigations x environments, made of whatever cells a store holds and of nothing else.
+
+Names are found by comparing a cell's stored configuration with what names stand for, so that a cell needs neither its
+study nor, if a package brought it, that package.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uard import InvalidValueError, __version__
+from uard.lab import registry as names
+from uard.lab import statistics
+from uard.lab.cell import plain
+from uard.lab.execution.store import Store
+from uard.lab.views.tables import number
+from uard.method.mitigations import NAMED, named
+
+RAW = "raw"
+HONEST, COLLUDING, TWIN = "honest raters", "colluding raters", "legitimate twin"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over seeds and its 95 % bootstrap interval."""
+
+    mean: float
+    low: float
+    high: float
+
+    def above(self, other: Estimate) -> bool:
+        """Whether it is larger and the intervals are apart."""
+        return self.low > other.high
+
+
+@dataclass(frozen=True)
+class Line:
+    """One cell.
+
+    Attributes:
+        environment: Its name, and what differs from what the name stands for; so are those of ``agent`` and
+            ``mitigation``.
+        agent: See ``environment``.
+        mitigation: See ``environment``.
+        panel: Who rates; "–" for the raw reward.
+        noise: Standard deviation of extra noise on every rater.
+        rated: Fraction of steps that are rated.
+        trained: For how long, and whatever else is unusual.
+        control: ``HONEST``, ``COLLUDING`` or ``TWIN``.
+        seeds: Finished ones.
+        failed: Seeds that could not be trained.
+        hacks: Share of steps that are hacks; None without finished seeds.
+        true: True return; None without finished seeds.
+    """
+
+    environment: str
+    agent: str
+    mitigation: str
+    panel: str
+    noise: float
+    rated: float
+    trained: str
+    control: str
+    seeds: int
+    failed: int
+    hacks: Estimate | None
+    true: Estimate | None
+
+    @property
+    def compared(self) -> bool:
+        """Whether it has an interval: one seed has none."""
+        return self.seeds > 1
+
+    @property
+    def place(self) -> tuple[str, str, str]:
+        """Where and how it was trained: what it shares with its raw rival."""
+        return self.environment, self.agent, self.trained
+
+    @property
+    def setting(self) -> tuple[Any, ...]:
+        """All but the mitigation."""
+        return (*self.place, self.panel, self.noise, self.rated)
+
+
+@dataclass(frozen=True)
+class Standing:
+    """One mitigation over all its settings; pairs are (how many, of how many).
+
+    Attributes:
+        mitigation: Its name.
+        settings: Lines with honest raters.
+        tamer: Settings in which it hacks less than the raw agent (intervals apart).
+        richer: In which its true return is higher than the raw agent's.
+        poorer: In which its true return is lower than the raw agent's.
+        unbeaten: In which no other mitigation has a higher true return, of those with rivals.
+        colluding: ``tamer`` where all raters repeat the lie; a mitigation that listens to them alone should fail.
+        cautious: ``poorer`` in legitimate twins, where the bonus is real: the price of caution.
+        failed: Seeds that could not be trained.
+    """
+
+    mitigation: str
+    settings: int
+    tamer: tuple[int, int]
+    richer: tuple[int, int]
+    poorer: tuple[int, int]
+    unbeaten: tuple[int, int]
+    colluding: tuple[int, int]
+    cautious: tuple[int, int]
+    failed: int
+
+
+def lines(store: Store) -> list[Line]:
+    """Return a line for every cell of the store, sorted by setting, the highest true return first."""
+    cells = store.cells()
+    known = _Names([cell.config for cell in cells])
+    seeds = [cell.metrics for cell in cells]
+    hacks = _estimates([[m["trap_visits"] / m["episode_length"] for m in s.values()] for s in seeds])
+    true = _estimates([[m["true_return"] for m in s.values()] for s in seeds])
+    made = [_line(c.config, known, len(c.metrics), c.failed, h, t) for c, h, t in zip(cells, hacks, true, strict=True)]
+    return sorted(made, key=lambda x: (*x.setting, -x.true.mean if x.true else np.inf, x.mitigation))
+
+
+def standings(these: Sequence[Line]) -> list[Standing]:
+    """Sum the lines up by mitigation, the one that is unbeaten in most settings first."""
+    raw = {x.place: x for x in these if x.mitigation == RAW and x.compared}
+    rivals: dict[Any, list[Line]] = defaultdict(list)
+    of: dict[str, list[Line]] = defaultdict(list)
+    for x in these:
+        of[x.mitigation].append(x)
+        if x.compared and x.mitigation != RAW:
+            rivals[x.setting].append(x)
+
+    def against_raw(some: Iterable[Line], better: Any) -> tuple[int, int]:
+        pairs = [(x, raw[x.place]) for x in some if x.compared and x.mitigation != RAW and x.place in raw]
+        return sum(better(x, r) for x, r in pairs), len(pairs)
+
+    def unbeaten(some: Iterable[Line]) -> tuple[int, int]:
+        fields = [
+            (x, [r for r in (*rivals[x.setting], raw.get(x.place)) if r and r is not x]) for x in some if x.compared
+        ]
+        fields = [(x, others) for x, others in fields if others]
+        return sum(not any(r.true.above(x.true) for r in others) for x, others in fields), len(fields)
+
+    out = []
+    for mitigation, every in of.items():
+        honest, fooled, twins = ([x for x in every if x.control == c] for c in (HONEST, COLLUDING, TWIN))
+        out.append(
+            Standing(
+                mitigation,
+                len(honest),
+                against_raw(honest, lambda x, r: r.hacks.above(x.hacks)),
+                against_raw(honest, lambda x, r: x.true.above(r.true)),
+                against_raw(honest, lambda x, r: r.true.above(x.true)),
+                unbeaten(honest),
+                against_raw(fooled, lambda x, r: r.hacks.above(x.hacks)),
+                against_raw(twins, lambda x, r: r.true.above(x.true)),
+                sum(x.failed for x in every),
+            )
+        )
+    return sorted(out, key=lambda s: (-s.unbeaten[0], -s.settings, s.mitigation))
+
+
+def share(pair: tuple[int, int]) -> float:
+    """Return how many of how many as a fraction; -1 of none."""
+    return pair[0] / pair[1] if pair[1] else -1.0
+
+
+def write(target: Path, store: Store) -> Path:
+    """Write the page and return its path.
+
+    Raises:
+        InvalidValueError: the store is empty, or the file cannot be written.
+    """
+    import jinja2
+
+    these = lines(store)
+    if not these:
+        raise InvalidValueError("store", store.path, "one with finished cells")
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    environment.globals.update(number=number, share=share)
+    every = standings(these)
+    page = environment.get_template("leaderboard.html.j2").render(
+        version=__version__,
+        named=[s for s in every if ", " not in s.mitigation],
+        varied=[s for s in every if ", " in s.mitigation],
+        sections=[(c, [x for x in these if x.control == c]) for c in (HONEST, COLLUDING, TWIN)],
+        filters={
+            name: list(dict.fromkeys(sorted(getattr(x, name) for x in these)))
+            for name in ("mitigation", "environment", "panel", "agent")
+        },
+        seeds=sum(x.seeds for x in these),
+        cells=len(these),
+    )
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise InvalidValueError("out", str(target), f"a file that can be written ({error})") from None
+    return target
+
+
+def _estimates(values: list[list[float]]) -> list[Estimate | None]:
+    out: list[Estimate | None] = [None] * len(values)
+    for size in {len(v) for v in values} - {0}:
+        places = [i for i, v in enumerate(values) if len(v) == size]
+        sample = np.array([values[i] for i in places])
+        for i, mean, (low, high) in zip(places, sample.mean(1), statistics.intervals(sample), strict=True):
+            out[i] = Estimate(float(mean), float(low), float(high))
+    return out
+
+
+def _line(
+    config: dict[str, Any], known: _Names, seeds: int, failed: int, hacks: Estimate | None, true: Estimate | None
+) -> Line:
+    mitigation = known.of("mitigation", config["mitigation"])
+    twin = config["environment"].get("legitimate", False)
+    trained = [f"{config['steps']:,} steps" if "steps" in config else f"{config['episodes']:,} episodes"]
+    tabular = "heads" in config["agent"]
+    if "steps" not in config and not tabular:
+        trained.append("learned ratings" if "feedback" in config else "running means")
+    trained += [f"{name} {config[name]}" for name in ("ddof", "snapshots") if config[name]]
+    return Line(
+        known.of("environment", config["environment"]),
+        known.of("agent", config["agent"]),
+        mitigation,
+        "–" if mitigation == RAW else config["panel"],
+        config["noise"],
+        config["rated"],
+        ", ".join(trained),
+        TWIN if twin else COLLUDING if config["panel"] == "colluding" else HONEST,
+        seeds,
+        failed,
+        hacks,
+        true,
+    )
+
+
+class _Names:
+    """What stored configurations are called."""
+
+    def __init__(self, configs: list[dict[str, Any]]):
+        """Learn the names in use, ours and those of installed packages."""
+        own = {
+            "environment": names.ENVIRONMENTS,
+            "agent": names.AGENTS,
+            "mitigation": {name: named(name) for name in NAMED},
+        }
+        self._prototypes: dict[tuple[str, str], list[tuple[str, dict[str, Any]]]] = defaultdict(list)
+        for kind, values in own.items():
+            theirs = {plugin.name: value for plugin, value in names.brought(kind)[0].items()}
+            more = names.CONTINUOUS if kind == "agent" else {}
+            for name, value in [*values.items(), *theirs.items(), *more.items()]:
+                config = plain(value)
+                self._prototypes[kind, config["class"]].append((name, _leaves(config)))
+        self._seen: dict[str, str] = {}
+        self._varies: dict[str, set[str]] = defaultdict(set)
+        first: dict[str, dict[str, Any]] = {}
+        for config in configs:
+            for kind in own:
+                leaves = _leaves(config[kind])
+                before = first.setdefault(config[kind]["class"], leaves)
+                changed = {k for k in leaves.keys() | before.keys() if leaves.get(k) != before.get(k)}
+                self._varies[config[kind]["class"]] |= changed
+
+    def of(self, kind: str, config: dict[str, Any]) -> str:
+        """Return the nearest name and what differs from it; the class and what varies if there is no name for it."""
+        key = f"{kind} {config}"
+        if key not in self._seen:
+            self._seen[key] = self._describe(kind, config)
+        return self._seen[key]
+
+    def _describe(self, kind: str, config: dict[str, Any]) -> str:
+        leaves, cls = _leaves(config), config["class"]
+        candidates = [(_different(leaves, base), name) for name, base in self._prototypes[kind, cls]]
+        exact = [name for changes, name in candidates if not changes]
+        if exact:
+            return exact[-1]  # of TrapGrid and TrapGrid6, which are equal, the one that says more
+        if candidates:
+            changes, name = min(candidates, key=lambda c: len(c[0]))
+        else:
+            changes, name = {k: leaves[k] for k in sorted(self._varies[cls]) if k in leaves}, cls.rpartition(".")[2]
+        return ", ".join([name, *(_said(k.rpartition(".")[2], v) for k, v in changes.items())])
+
+
+def _leaves(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return a configuration's settings by their dotted names."""
+    out: dict[str, Any] = {}
+    for name, value in config.items():
+        if isinstance(value, dict):
+            out |= _leaves(value, f"{prefix}{name}.")
+        elif name != "class" or prefix:
+            out[prefix + name] = value
+    return out
+
+
+def _different(leaves: dict[str, Any], base: dict[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in sorted(leaves.items()) if k not in base or base[k] != v}
+
+
+def _said(name: str, value: Any) -> str:
+    if isinstance(value, bool):
+        return name if value else f"{name} off"
+    return f"{name} {value:g}" if isinstance(value, float) else f"{name} {str(value).replace(' ', '')}"

@@ -1,0 +1,1 @@
+"""The method: pure functions of NumPy, JAX and torch arrays, and frozen dataclasses."""

@@ -1,0 +1,223 @@
+"""The two sources of doubt: an ensemble's disagreement and annotators' disagreement (A12-A18).
+
+Pure functions of NumPy, JAX or torch arrays. All sigmas carry the unit of the reward.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import warnings
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from uard import _checks
+from uard.method.arrays import Array, namespace
+
+
+class OneAnnotatorWarning(UserWarning):
+    """sigma_h of a single annotator is 0 everywhere, which means blind trust."""
+
+
+def sigma_model(values: Array, axis: int = -1, ddof: int = 1) -> Array:
+    """sigma_m: standard deviation over the members of an ensemble (A12, A17).
+
+    Args:
+        values: Estimates of the members, e.g. (..., N) with N members on ``axis``.
+        axis: The axis of the members.
+        ddof: 1 for the paper's 1/(N-1), 0 for 1/N.
+
+    Raises:
+        InvalidValueError: if a value is not finite or there are no more than ``ddof`` members.
+    """
+    values = _floats("values", values)
+    _enough("members", values.shape[axis] if values.ndim else 0, ddof)
+    _checks.finite("values", values)
+    return _std(values, axis, ddof)
+
+
+def sigma_human(
+    ratings: Array,
+    axis: int = -1,
+    ddof: int = 0,
+    mask: Array | None = None,
+    empty: float | None = None,
+) -> Array:
+    """sigma_h: standard deviation over the annotators' ratings of one state-action (A14, A18).
+
+    Args:
+        ratings: Ratings, e.g. (..., K) with K annotators on ``axis``.
+        axis: The axis of the annotators.
+        ddof: 0, the population form, is what the paper's number 1.247 needs ({-1, 2, 1}); its equation (A14)
+            prints 1.
+        mask: True where a rating exists; same shape. Masked-out entries may hold anything, NaN included.
+        empty: What to return where no more than ``ddof`` ratings exist. Without it such a place is an error (NaN
+            inside a JAX transformation, which can raise none).
+
+    Raises:
+        InvalidValueError: for NaN, infinity or ``None`` where a rating should be, a mask of another shape, no
+            annotators at all, or places without ratings and no ``empty``.
+
+    Warns:
+        OneAnnotatorWarning: a single annotator never disagrees with itself.
+    """
+    if mask is not None and not hasattr(mask, "shape"):
+        mask = _checks.as_numpy("mask", mask)
+    ratings = _floats("ratings", ratings, mask)
+    raters = ratings.shape[axis] if ratings.ndim else 0
+    if raters == 0:
+        raise _checks.InvalidValueError("ratings.shape", tuple(ratings.shape), "at least one annotator on the axis")
+    if raters == 1:
+        warnings.warn(
+            "one annotator: sigma_h is 0 everywhere, which means blind trust in the reward; "
+            "count the observed reward as one more rater (uncertainty.with_proxy)",
+            OneAnnotatorWarning,
+            stacklevel=2,
+        )
+    if mask is None:
+        _checks.finite("ratings", ratings)
+        if raters <= ddof:
+            if empty is None:
+                _enough("annotators", raters, ddof)
+            return namespace(ratings).sum(ratings * 0.0, axis=axis) + empty
+        return _std(ratings, axis, ddof)
+    xp = namespace(ratings, mask)
+    ratings, here = xp.asarray(ratings), xp.asarray(mask)
+    _checks.same_shape("mask", here, "ratings", ratings)
+    return _masked_std(ratings, here if xp.isdtype(here.dtype, "bool") else here != 0, axis, ddof, empty)
+
+
+def _floats(field: str, values: Array, mask: Array | None = None) -> Array:
+    """Return an array of floats: lists become NumPy's, integers (stars, thumbs) become floats."""
+    if not hasattr(values, "shape") or (isinstance(values, np.ndarray | np.generic) and values.dtype.kind != "f"):
+        if mask is not None:
+            with contextlib.suppress(ValueError):  # rows of unequal length: the check below says so
+                cells = np.asarray(values, dtype=object)
+                values = np.where(mask, cells, 0.0).tolist() if cells.shape == np.shape(mask) else values
+        return _checks.as_numpy(field, values)
+    xp = namespace(values)
+    return values if xp.isdtype(values.dtype, "real floating") else xp.astype(values, xp.asarray(0.0).dtype)
+
+
+def _std(values: Array, axis: int, ddof: int) -> Array:
+    xp = namespace(values)
+    centre = xp.mean(values, axis=axis, keepdims=True)
+    square = (values - centre) * (values - centre)
+    return _root(xp.sum(square, axis=axis) / (values.shape[axis] - ddof))
+
+
+def _root(variance: Array) -> Array:
+    """Return the square root; its gradient where all agree is 0, not infinite: an actor may climb a score of it."""
+    xp = namespace(variance)
+    apart = xp.where(variance == 0, xp.ones_like(variance), xp.zeros_like(variance))
+    return xp.sqrt(variance + apart) - apart
+
+
+def _masked_std(ratings: Array, mask: Array, axis: int, ddof: int, empty: float | None) -> Array:
+    xp = namespace(ratings)
+    values = xp.where(mask, ratings, xp.zeros_like(ratings))
+    _checks.finite("ratings", values)
+    here = xp.astype(mask, ratings.dtype)
+    count = xp.sum(here, axis=axis, keepdims=True)
+    few = count <= ddof
+    if empty is None and not _checks.is_traced(few) and bool(xp.any(few)):
+        raise _checks.InvalidValueError(
+            "mask", "a place with too few ratings", f"more than {ddof} everywhere, or give empty="
+        )
+    one = xp.ones_like(count)
+    centre = xp.sum(values, axis=axis, keepdims=True) / xp.where(count > 0, count, one)
+    square = xp.where(mask, (values - centre) * (values - centre), xp.zeros_like(values))
+    variance = xp.sum(square, axis=axis, keepdims=True) / xp.where(few, one, count - ddof)
+    sigma = xp.where(few, one * (math.nan if empty is None else empty), _root(variance))
+    return xp.squeeze(sigma, axis=axis)
+
+
+def _enough(what: str, count: int, ddof: int) -> None:
+    if count <= ddof:
+        raise _checks.InvalidValueError(f"number of {what}", count, f"more than ddof = {ddof}")
+
+
+def with_proxy(mean: Array, sigma: Array, proxy: Array, raters: Array) -> Array:
+    """sigma_h over K ratings *and* the observed reward, the proxy counted as one more rater.
+
+    The population standard deviation of the union, from its parts: with K ratings of mean m and deviation s,
+    var = K/(K+1) s^2 + K/(K+1)^2 (m - r)^2. Its second term is the plainest sign that a reward lies.
+
+    Args:
+        mean: Mean rating m.
+        sigma: Population deviation s of the ratings, >= 0.
+        proxy: Observed reward r.
+        raters: Number of annotators K >= 1.
+    """
+    share = raters / (raters + 1.0)
+    gap = mean - proxy
+    variance = share * (sigma * sigma) + share / (raters + 1.0) * (gap * gap)
+    return namespace(variance).sqrt(variance) if hasattr(variance, "shape") else variance**0.5
+
+
+def shrink(sigma: Array, count: Array, prior: Array, strength: Array = 1.0) -> Array:
+    """(n sigma + n0 prior) / (n + n0): a deviation from few ratings, drawn towards what is usual.
+
+    Args:
+        sigma: Estimate from ``count`` rated visits; means nothing (may be NaN) where that is 0.
+        count: Number of rated visits n >= 0.
+        prior: What is usual, e.g. the mean over all state-actions.
+        strength: Pseudo-count n0 >= 0; with n0 = 0 nothing is shrunk (and n = 0 gives the prior).
+    """
+    total = count + strength
+    if not hasattr(total, "shape"):
+        return prior if count == 0 else (count * sigma + strength * prior) / total
+    xp = namespace(total, sigma)
+    safe = xp.where(total > 0, total, xp.ones_like(total))
+    heard = xp.where(count + 0.0 * total > 0, count * sigma, xp.zeros_like(total))
+    return xp.where(total > 0, (heard + strength * prior) / safe, prior + 0.0 * total)
+
+
+class Spread(NamedTuple):
+    """What is usual for a quantity over distinct state-actions."""
+
+    location: Array
+    deviation: Array
+
+
+def spread(values: Array, mask: Array) -> Spread:
+    """Mean and mean absolute deviation of the masked-in values; both 0 if there are none.
+
+    Taken over *distinct* state-actions: an agent that sits in a trap must not dilute its own alarm.
+    """
+    xp = namespace(values)
+    zero = xp.zeros_like(values)
+    count = xp.sum(xp.where(mask, xp.ones_like(values), zero))
+    count = xp.where(count > 0, count, xp.ones_like(count))
+    location = xp.sum(xp.where(mask, values, zero)) / count
+    deviation = xp.sum(xp.where(mask, xp.abs(values - location), zero)) / count
+    return Spread(location, deviation)
+
+
+def ratings_from(rows: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Turn rows of numbers with ``None`` for a missing rating into (ratings, mask).
+
+    Raises:
+        InvalidValueError: rows of unequal length, or an entry that is neither a finite number nor ``None``;
+            the message names row and column.
+    """
+    try:
+        table = [list(row) for row in rows]
+    except TypeError:
+        raise _checks.InvalidValueError("ratings", rows, "a list of rows, one rating per annotator in each") from None
+    width = len(table[0]) if table else 0
+    ratings, mask = np.zeros((len(table), width)), np.zeros((len(table), width), dtype=bool)
+    for i, row in enumerate(table):
+        if len(row) != width:
+            raise _checks.InvalidValueError(f"ratings[{i}]", row, f"a row of {width} ratings, like the first")
+        for j, entry in enumerate(row):
+            if entry is None:
+                continue
+            try:
+                _checks.number("", entry)
+            except _checks.InvalidValueError:
+                allowed = "a finite number, or None where a rating is missing"
+                raise _checks.InvalidValueError(f"ratings[{i}, {j}]", entry, allowed) from None
+            ratings[i, j], mask[i, j] = entry, True
+    return ratings, mask

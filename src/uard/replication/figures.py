@@ -1,0 +1,337 @@
+"""The paper's figures (G2-G5, G8, G9, G11-G16) from our runs, and ours. Every function returns a figure."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from uard.lab.study import Row
+from uard.lab.views.evidence import Evidence
+from uard.method.stability import DEFINITIONS, perturbed_advantage
+from uard.method.weights import exponential_weight, linear_weight, reciprocal_weight
+from uard.replication import paper, theory
+
+matplotlib.use("Agg")
+
+COLOURS = {
+    "baseline": "#c1272d",
+    "raw": "#c1272d",
+    "multi-head": "#e08214",
+    "uard-paper": "#2c6fbb",
+    "uard-consistent": "#7b4fa3",
+    "uard": "#1b8a4b",
+    "random walk": "#777777",
+    "mean-of-annotations": "#8c6d31",
+    "worst-of-annotations": "#17a2b8",
+    "lcb": "#d6589f",
+    "screening": "#999933",
+}
+_STYLE: Any = {
+    "font.size": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "figure.dpi": 110,
+    "legend.frameon": False,
+    "axes.titlesize": 12,
+}
+
+
+def data_uri(figure: Figure) -> str:
+    """Return a figure as a PNG that needs no file beside the page."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def _axes(columns: int = 1, width: float = 7.0, height: float = 3.8) -> tuple[Figure, list[Axes]]:
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(width * columns, height), layout="constrained")
+        axes = figure.subplots(1, columns, squeeze=False)[0]
+    return figure, list(axes)
+
+
+def _smooth(curves: np.ndarray, width: int = 10) -> np.ndarray:
+    kernel = np.ones(width) / width
+    return np.stack([np.convolve(c, kernel, "valid") for c in curves])
+
+
+def _curve(axis: Axes, curves: np.ndarray, label: str, colour: str) -> None:
+    """Seeds as thin lines, mean as a thick one; moving average over 10 episodes."""
+    smooth = _smooth(curves)
+    x = np.arange(smooth.shape[1]) + 10
+    for line in smooth:
+        axis.plot(x, line, color=colour, lw=0.4, alpha=0.35)
+    axis.plot(x, smooth.mean(0), color=colour, lw=2, label=label)
+
+
+def filters(e: Evidence) -> Figure:
+    """G2: weights against uncertainty, and what each form does to the paper's trap."""
+    figure, (left, right) = _axes(2, 5.5)
+    u = np.linspace(0, 5, 400)
+    for label, weight in (
+        ("reciprocal", reciprocal_weight(u)),
+        ("exponential", exponential_weight(u)),
+        ("linear (mu = 4)", linear_weight(u, np.full_like(u, 4.0))),
+    ):
+        left.plot(u, weight, lw=2, label=label)
+    left.axvline(0.5 * paper.SIGMA_H_AT_TRAP, color="k", ls=":", lw=1)
+    left.annotate("the paper's trap", (0.5 * paper.SIGMA_H_AT_TRAP, 0.95), (0.9, 0.95), fontsize=9)
+    left.set(xlabel="uncertainty U", ylabel="weight w", title="Filters at lambda = 2")
+    left.legend()
+    forms = list(dict.fromkeys(r["form"] for r in e.studies["filters"].rows))
+    for i, reading in enumerate(("uard-paper", "uard-consistent", "uard")):
+        s = [e.get("filters", "goal_rate", form=f, reading=reading) for f in forms]
+        place = np.arange(len(forms)) + (i - 1) * 0.26
+        right.bar(place, [x.mean for x in s], 0.24, color=COLOURS[reading], label=reading)
+        low, high = np.array([[x.mean - x.ci95[0], x.ci95[1] - x.mean] for x in s]).T
+        right.errorbar(place, [x.mean for x in s], np.stack([low, high]), fmt="none", color="k", lw=1)
+    right.set_xticks(range(len(forms)), [f.replace("certainty-equivalent", "certainty\nequivalent") for f in forms])
+    right.set(ylabel="goal rate, 6x6", title="Where the form acts, by reading", ylim=(0, 1.25))
+    right.legend(ncols=3, loc="upper center")
+    return figure
+
+
+def _training(e: Evidence, column: str, agents: Sequence[str], ylabel: str, title: str) -> Figure:
+    figure, axes = _axes(2, 5.8)
+    for axis, panel in zip(axes, ("main", "appendix"), strict=True):
+        for agent in agents:
+            _curve(axis, e.curves("table4", column, agent=agent, panel=panel), agent, COLOURS[agent])
+        axis.set(xlabel="episode", ylabel=ylabel, title=f"{title}, {panel} panel")
+    axes[0].legend()
+    return figure
+
+
+def hero(e: Evidence) -> Figure:
+    """G3: observed return against episode; the paper shows a sharp turn to the goal near episode 400."""
+    figure = _training(e, "observed_return", ("baseline", "uard-paper", "uard"), "observed return", "6x6")
+    for axis in figure.axes:
+        axis.axvline(400, color="k", ls=":", lw=1)
+        axis.annotate("the paper's turn", (400, 40), (405, 40), fontsize=9)
+    return figure
+
+
+def trap_visits(e: Evidence) -> Figure:
+    """G4: trap visits per episode."""
+    agents = ("baseline", "multi-head", "uard-paper", "uard")
+    return _training(e, "trap_visits", agents, "trap visits per episode", "6x6")
+
+
+def alignment_gap(e: Evidence) -> Figure:
+    """G5: observed and true return of the baseline drift apart; of ``uard`` they do not."""
+    figure, axes = _axes(2, 5.8)
+    for axis, agent in zip(axes, ("baseline", "uard"), strict=True):
+        _curve(axis, e.curves("table4", "observed_return", agent=agent, panel="main"), "observed", "#2c6fbb")
+        _curve(axis, e.curves("table4", "true_return", agent=agent, panel="main"), "true", "#e08214")
+        axis.set(xlabel="episode", ylabel="return", title=f"{agent}, 6x6, main panel")
+        axis.legend()
+    return figure
+
+
+def true_return(e: Evidence) -> Figure:
+    """G8: true return against episode."""
+    return _training(e, "true_return", ("baseline", "multi-head", "uard-paper", "uard"), "true return", "6x6")
+
+
+def uncertainty(e: Evidence) -> Figure:
+    """G9: both uncertainties over training, at the trap and elsewhere."""
+    figure, axes = _axes(2, 5.8)
+    for axis, panel in zip(axes, ("main", "appendix"), strict=True):
+        row = e.row("uncertainty", agent="uard-paper", panel=panel, heads="bootstrapped")
+        curves = np.stack([r.extra["uncertainty"] for r in e.results(row.cell)]).astype(float)
+        x = (np.arange(curves.shape[1]) + 1) * 500 / curves.shape[1]
+        lines = (("sigma_m, trap", "#2c6fbb", "-"), ("sigma_m, elsewhere", "#2c6fbb", ":"))
+        lines += (("sigma_h, trap", "#c1272d", "-"), ("sigma_h, elsewhere", "#c1272d", ":"))
+        for i, (label, colour, style) in enumerate(lines):
+            mean, sd = curves[:, :, i].mean(0), curves[:, :, i].std(0, ddof=1)
+            axis.plot(x, mean, color=colour, ls=style, lw=2, label=label)
+            axis.fill_between(x, mean - sd, mean + sd, color=colour, alpha=0.12, lw=0)
+        axis.axhline(paper.SIGMA_H_AT_TRAP, color="k", lw=1, ls="--")
+        axis.annotate("1.247 in the paper", (10, paper.SIGMA_H_AT_TRAP + 0.02), fontsize=9)
+        axis.set(xlabel="episode", ylabel="uncertainty", title=f"uard-paper, 6x6, {panel} panel", ylim=(0, None))
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
+
+
+def noise(e: Evidence) -> Figure:
+    """G11 on the grid: trap visits against rater noise, in both units."""
+    figure, axes = _axes(2, 5.8)
+    rng = np.random.default_rng(0)
+    agents = ("baseline", "mean of ratings", "uard-paper", "uard")
+    for axis, unit in zip(axes, ("reward units", "of the trap's reward"), strict=True):
+        for agent in agents:
+            colour = COLOURS.get(agent, COLOURS["mean-of-annotations"])
+            levels = (0, 10, 20, 30)
+            v = [e.per_seed("noise", "trap_visits", agent=agent, panel="main", percent=p, unit=unit) for p in levels]
+            mean, sd = np.array([x.mean() for x in v]), np.array([x.std(ddof=1) for x in v])
+            axis.plot(levels, mean, "o-", color=colour, lw=2, label=agent)
+            axis.fill_between(levels, mean - sd, mean + sd, color=colour, alpha=0.15, lw=0)
+            for level, x in zip(levels, v, strict=True):
+                axis.plot(level + rng.uniform(-0.6, 0.6, x.size), x, ".", color=colour, ms=3, alpha=0.5)
+        axis.set(xlabel=f"noise on every rater, % {unit}", ylabel="trap visits per episode", title="6x6, main panel")
+        axis.set_xticks((0, 10, 20, 30))
+    axes[0].legend()
+    return figure
+
+
+def sign_preservation(e: Evidence) -> Figure:
+    """G13: the advantage of entering the trap against a reward perturbation, by three definitions."""
+    figure, axes = _axes(3, 4.4, 3.6)
+    for axis, definition, radius in zip(axes, DEFINITIONS, theory.radii(), strict=True):
+        epsilon = np.linspace(0, 10, 200)
+        for label, weight, colour in (("raw", 1.0, COLOURS["raw"]), ("filtered", radius.weight, COLOURS["uard-paper"])):
+            y = perturbed_advantage(radius.advantage, epsilon, weight, definition)
+            axis.plot(epsilon, y, color=colour, lw=2, label=label)
+        axis.axhline(0, color="k", lw=1)
+        axis.set(xlabel="reward perturbation", ylabel="advantage", title=f"'{definition}'")
+    axes[0].legend()
+    return figure
+
+
+def learning_curves(e: Evidence) -> Figure:
+    """G16: observed return of every agent on 6x6."""
+    agents = ("baseline", "multi-head", "uard-paper", "uard-consistent", "uard", "random walk")
+    return _training(e, "observed_return", agents, "observed return", "6x6")
+
+
+def competition(e: Evidence) -> Figure:
+    """True return of the serious rivals against rater noise, 10x10."""
+    figure, axes = _axes(2, 5.8)
+    noises = list(dict.fromkeys(r["noise"] for r in e.studies["matrix"].rows))
+    for axis, panel in zip(axes, ("main", "appendix"), strict=True):
+        for name in ("mean-of-annotations", "worst-of-annotations", "lcb", "uard-consistent", "uard"):
+            s = [
+                e.get("matrix", "true_return", mitigation=name, size=10, trap=4.0, panel=panel, noise=z) for z in noises
+            ]
+            axis.plot(range(len(noises)), [x.mean for x in s], "o-", color=COLOURS[name], lw=2, label=name)
+            axis.fill_between(
+                range(len(noises)),
+                [x.ci95[0] for x in s],
+                [x.ci95[1] for x in s],
+                color=COLOURS[name],
+                alpha=0.15,
+                lw=0,
+            )
+        axis.set_xticks(range(len(noises)), [f"{z:g}" for z in noises])
+        axis.set(
+            xlabel="sd of rater noise, reward units",
+            ylabel="true return",
+            title=f"10x10, +4, {panel} panel",
+            ylim=(-12, 9),
+        )
+    axes[0].legend(loc="lower left")
+    return figure
+
+
+def budgets(e: Evidence) -> Figure:
+    """True return against the share of steps that are rated, 10x10."""
+    rows: list[Row] = list(e.studies["budgets"].rows)
+    names = list(dict.fromkeys(r["mitigation"] for r in rows))
+    figure, axes = _axes(4, 3.6, 3.8)
+    shown = [(p, z) for p in ("main", "appendix") for z in (0.0, 1.2)]
+    for axis, (panel, level) in zip(axes, shown, strict=True):
+        for name in names:
+            s = [
+                e.get("budgets", "true_return", mitigation=name, panel=panel, noise=level, rated=b)
+                for b in (0.01, 0.1, 1.0)
+            ]
+            base = (
+                name.split(",")[0]
+                .replace("worst-of", "worst-of-annotations")
+                .replace("-annotations-annotations", "-annotations")
+            )
+            axis.plot(
+                range(3),
+                [x.mean for x in s],
+                "o--" if "," in name else "o-",
+                color=COLOURS.get(base, "k"),
+                lw=1.6,
+                ms=4,
+                label=name,
+            )
+        axis.set_xticks(range(3), ["1 %", "10 %", "100 %"])
+        axis.set(xlabel="steps rated", title=f"{panel}, noise {level:g}", ylim=(-14, 9))
+    axes[0].set_ylabel("true return")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
+    return figure
+
+
+def walks(e: Evidence) -> Figure:
+    """What the trained agents do: visits per cell of their greedy walk on 10x10."""
+    figure, axes = _axes(3, 4.2, 4.4)
+    for axis, agent in zip(axes, ("baseline", "uard-paper", "uard"), strict=True):
+        cell = e.row("scale", agent=agent, size=10, panel="main").cell
+        path = e.results(cell)[0].path
+        grid = cell.environment
+        counts = np.bincount(path, minlength=grid.states).reshape(grid.size, grid.size)
+        axis.imshow(np.where(counts > 0, np.log1p(counts), np.nan), cmap="Blues", vmin=0, vmax=np.log1p(900))
+        rows, columns = np.divmod(path, grid.size)
+        axis.plot(columns, rows, color=COLOURS[agent], lw=1.5)
+        for trap in grid.traps or ():
+            axis.text(trap[1], trap[0], "+4", ha="center", va="center", color="#c1272d", weight="bold")
+        axis.text(
+            grid.size - 1, grid.size - 1, "goal", ha="center", va="center", color="#1b8a4b", weight="bold", fontsize=9
+        )
+        axis.text(0, 0, "start", ha="center", va="center", fontsize=8)
+        for (r, c), n in np.ndenumerate(counts):
+            if n > 1:
+                axis.text(c, r + 0.3, f"{n}x", ha="center", va="center", fontsize=10, weight="bold")
+        axis.set_xticks(np.arange(-0.5, grid.size), [])
+        axis.set_yticks(np.arange(-0.5, grid.size), [])
+        axis.tick_params(length=0)
+        end = "reaches the goal" if path[-1] == grid.states - 1 else f"never arrives in {len(path) - 1} steps"
+        axis.set_title(f"{agent}: {end}")
+    return figure
+
+
+def adjusted_reward(
+    rivals: dict[str, tuple[np.ndarray, str]], ours: np.ndarray, label: str, windows: Sequence[tuple[int, int]]
+) -> Figure:
+    """G14, G15: the confidence-adjusted reward of each rival (steps and colour) and ours, windows shaded."""
+    figure, axes = _axes(len(rivals), 6.2, 3.8)
+    for axis, (rival, (values, colour)) in zip(axes, rivals.items(), strict=True):
+        _shade(axis, windows)
+        axis.plot(values, color=colour, lw=1, label=rival)
+        axis.plot(ours, color=COLOURS["uard"], lw=1.2, label=label)
+        axis.set(ylabel="confidence-adjusted reward")
+        _legend_below(axis)
+    return figure
+
+
+def hacking_region(trace: np.ndarray, windows: Sequence[tuple[int, int]]) -> Figure:
+    """G12: what is learned from in a hacking region, and lambda_t.
+
+    The trace's first rows are the observed, the adjusted and Caution's reward, and lambda_t.
+    """
+    figure, axes = _axes(2, 6.2, 3.8)
+    observed, adjusted, caution, lam = trace[:4]
+    for axis in axes:
+        _shade(axis, windows)
+    axes[0].plot(observed, color=COLOURS["raw"], lw=1, label="naive (observed)")
+    axes[0].plot(caution, color=COLOURS["lcb"], lw=1, label="Caution (mean - sd)")
+    axes[0].plot(adjusted, color=COLOURS["uard"], lw=1.2, label="uard")
+    axes[0].set(ylabel="effective reward")
+    _legend_below(axes[0])
+    axes[1].plot(lam, color=COLOURS["uard"], lw=1)
+    axes[1].set(ylabel="lambda_t", yscale="log")
+    return figure
+
+
+def _shade(axis: Axes, windows: Sequence[tuple[int, int]]) -> None:
+    for a, b in windows:
+        axis.axvspan(a, b, color="#f2d7a0", alpha=0.6, lw=0)
+    axis.set(xlabel="step")
+
+
+def _legend_below(axis: Axes) -> None:
+    low, high = axis.get_ylim()
+    axis.set_ylim(bottom=low - 0.35 * (high - low))
+    axis.legend(loc="lower right")

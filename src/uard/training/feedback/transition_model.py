@@ -1,0 +1,260 @@
+"""What a learner in a continuous world knows of its raters: a sample of rated steps, and a model for all others.
+
+No step comes twice, so there are no running means. ``Reservoir`` is a uniform sample of all steps rated so far (it must
+not forget what honest steps look like when the agent no longer takes them); ``TransitionModel`` regresses what each
+rater said, and how far apart they were, on (s, a, s', observed reward). sigma_h of a step is composed at use from the
+predicted ratings and the reward that was observed, which tells hacks apart far better than a predicted spread. The
+lowest rating is that of the rater who is predicted to say least: what the lowest of several noisy ratings is on average
+sinks with the noise, and an agent that can end its episode then prefers to fall.
+
+Noise also makes predictions err, so that raters seem to differ, and steps to be disputed, where nothing is. Only that
+part of a difference counts that is more than the members' own deviation (``beyond``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array, lax
+
+from uard import _checks
+from uard.agents.networks import Layer, descend, mlp, through
+from uard.method.mitigations import Feedback, Mitigation, Usual
+
+QUERIES = ("random", "doubtful")  # which steps are rated
+
+
+@dataclass(frozen=True)
+class TransitionModel:
+    """An ensemble regression on a sample of rated steps.
+
+    Attributes:
+        members: Networks, >= 2.
+        hidden: Width of their two hidden layers.
+        learning_rate: Adam's step size.
+        fits: Minibatches per fit; there is one fit per 2048 environment steps.
+        batch: Rated steps per minibatch.
+        prior_scale: Size of the fixed random functions, in units of the ratings' deviation, > 0. It says how much is
+            unknown before anybody rates: where noise makes the members differ by as much, nothing counts as known.
+        capacity: Rated steps kept.
+        deviations: Deviations of the members, >= 0, by which differences are reduced before they count; see ``beyond``.
+    """
+
+    members: int = 5
+    hidden: int = 64
+    learning_rate: float = 1e-3
+    fits: int = 200
+    batch: int = 256
+    prior_scale: float = 1.0
+    capacity: int = 16_384
+    deviations: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        _checks.whole("members", self.members, low=2, high=64)
+        _checks.whole("hidden", self.hidden, low=1, high=4096)
+        _checks.number("learning_rate", self.learning_rate, low=0, high=1, open_low=True)
+        _checks.whole("fits", self.fits, low=1, high=100_000)
+        _checks.whole("batch", self.batch, low=1, high=65_536)
+        _checks.number("prior_scale", self.prior_scale, low=0, open_low=True)
+        _checks.whole("capacity", self.capacity, low=self.batch, high=10_000_000)
+        _checks.number("deviations", self.deviations, low=0)
+
+
+class Reservoir(NamedTuple):
+    """A uniform sample of the rated steps, on the host; changed in place.
+
+    Attributes:
+        inputs: (M, features) of the steps.
+        heard: (M, K + 1), what each rater said, and their deviation.
+        seen: (1,), how many steps were rated so far.
+    """
+
+    inputs: np.ndarray
+    heard: np.ndarray
+    seen: np.ndarray
+
+
+def features(observation: Any, action: Any, following: Any, reward: Any) -> Any:
+    """Return what the model sees of steps: (..., 2 F + D + 1)."""
+    xp = jnp if isinstance(observation, jax.Array) else np
+    return xp.concatenate([observation, action, following - observation, reward[..., None]], -1)
+
+
+def width(features: int, actions: int) -> int:
+    """Return how many features of a step there are."""
+    return 2 * features + actions + 1
+
+
+def empty(spec: TransitionModel, width: int, raters: int) -> Reservoir:
+    """Return a reservoir of nothing."""
+    inputs, heard = (np.zeros((spec.capacity, w), np.float32) for w in (width, raters + 1))
+    return Reservoir(inputs, heard, np.zeros(1, np.int64))
+
+
+def keep(kept: Reservoir, inputs: np.ndarray, ratings: np.ndarray, random: np.random.Generator, ddof: int = 0) -> None:
+    """Put rated steps into the sample [Vitter 1985, algorithm R]; ratings (B, K)."""
+    capacity = len(kept.inputs)
+    spread = ratings.std(1, ddof=ddof) if ratings.shape[1] > 1 else np.zeros(len(ratings))
+    heard = np.column_stack([ratings, spread])
+    numbers = kept.seen[0] + np.arange(len(inputs))
+    places = np.where(numbers < capacity, numbers, random.integers(0, numbers + 1))
+    for place, x, y in zip(places, inputs, heard, strict=True):  # in order: a later one may take an earlier's place
+        if place < capacity:
+            kept.inputs[place], kept.heard[place] = x, y
+    kept.seen[0] += len(inputs)
+
+
+def chosen(query: str, share: float, knows: Callable[[], np.ndarray], rows: int, random: np.random.Generator) -> Any:
+    """Return which of some steps are to be rated, (rows,) of bool, a ``share`` of them on average.
+
+    Args:
+        query: ``random``, each by itself; or ``doubtful``: half of them at random, so that the usual is not forgotten,
+            half where the model knows least (uncertainty sampling).
+        share: In [0, 1].
+        knows: Gives how many ratings the model's predictions are worth, (rows,); asked only if that matters.
+        rows: How many steps.
+        random: Source of chance.
+    """
+    if query == "random":
+        return random.random(rows) < share
+    number = random.binomial(rows, share)
+    order = random.permutation(rows)
+    blind, rest = order[: number - number // 2], order[number - number // 2 :]
+    least = rest[np.argsort(knows()[rest], kind="stable")[: number // 2]]
+    out = np.zeros(rows, bool)
+    out[np.concatenate([blind, least])] = True
+    return out
+
+
+class Model(NamedTuple):
+    """Layers, Adam's moments, and the units: location and scale of the inputs, location of what was said, its scale."""
+
+    layers: tuple[Layer, ...]
+    prior: tuple[Layer, ...]
+    optimiser: Any
+    centre: Array
+    width: Array
+    location: Array
+    scale: Array
+
+
+def init(spec: TransitionModel, key: Array, width: int, raters: int) -> Model:
+    """Draw a fresh model."""
+    own, fixed = jax.random.split(key)
+    layers = mlp(own, (width, spec.hidden, spec.hidden, raters + 1), spec.members, last_gain=0.1)
+    prior = mlp(fixed, (width, spec.hidden, raters + 1), spec.members)
+    zeros, ones = jnp.zeros(width, jnp.float32), jnp.ones(width, jnp.float32)
+    location = jnp.zeros(raters + 1, jnp.float32)
+    return Model(layers, prior, optax.adam(spec.learning_rate).init(layers), zeros, ones, location, jnp.float32(1.0))
+
+
+def _predict(spec: TransitionModel, layers: Any, prior: Any, inputs: Array) -> Array:
+    """Return (members, B, K + 1), in units of the ratings' deviation."""
+    return through(layers, inputs) + spec.prior_scale * lax.stop_gradient(through(prior, inputs))
+
+
+def _normal(model: Model, inputs: Array) -> Array:
+    return jnp.clip((inputs - model.centre) / model.width, -5.0, 5.0)
+
+
+def beyond(differences: Array, deviations: float) -> Array:
+    """Return the mean over members (M, ...) less some of their deviations, 0 where it is not larger.
+
+    Soft thresholding [Donoho 1995] at how far the members are apart.
+    """
+    mean = differences.mean(0)
+    return jnp.sign(mean) * jnp.maximum(jnp.abs(mean) - deviations * differences.std(0, ddof=1), 0.0)
+
+
+def read(spec: TransitionModel, model: Model, inputs: Array, raters: int) -> Feedback:
+    """Predict the feedback of steps (B, width); ``proxy`` is the reward that was observed.
+
+    ``count`` is how many ratings the prediction is worth, as in ``feedback.learned``.
+    """
+    x = _normal(model, inputs)
+    out = _predict(spec, model.layers, model.prior, x)
+    before = spec.prior_scale**2 * through(model.prior, x).var(0, ddof=1).mean(-1)
+    after = out.var(0, ddof=1).mean(-1)
+    count = jnp.maximum(before / jnp.maximum(after, 1e-6) - 1.0, 0.0)
+    said = model.location + model.scale * out
+    ratings = said[..., :-1]
+    means = ratings.mean(-1, keepdims=True)
+    mean = means.mean((0, 2))
+    lowest = mean + beyond(ratings - means, spec.deviations).min(-1)
+    typical = model.location[-1]
+    spread = jnp.maximum(typical + beyond(said[..., -1] - typical, spec.deviations), 0.0)
+    return Feedback(count, mean, lowest, spread, inputs[:, -1], jnp.asarray(raters, jnp.float32))
+
+
+@partial(jax.jit, static_argnames="spec")
+def worth(spec: TransitionModel, model: Model, inputs: Array) -> Array:
+    """Return ``read``'s count alone, (B,)."""
+    return read(spec, model, inputs, 1).count
+
+
+def nothing(rows: int, raters: int) -> Feedback:
+    """Return the feedback of steps that nobody was asked about."""
+    zeros = jnp.zeros(rows, jnp.float32)
+    return Feedback(zeros, zeros, zeros, zeros, zeros, jnp.asarray(raters, jnp.float32))
+
+
+def usual(mitigation: Mitigation, spec: TransitionModel, model: Any, kept: Array, seen: Array, raters: int) -> Any:
+    """Return what is usual over the rated steps that were kept; ``model`` () was never asked."""
+    if model == ():
+        return mitigation.usual(nothing(1, raters), jnp.zeros(1, bool))
+    feedback = read(spec, model, kept, raters)
+    return mitigation.usual(feedback, (jnp.arange(kept.shape[0]) < seen) & (feedback.count > 0))
+
+
+def expecting(usual: Any, feedback: Feedback) -> Any:
+    """Return what is usual, with what each step is predicted to be worth at least in the place of what all are.
+
+    Anchors of few ratings are drawn towards the latter. A prediction is a regression's: it has been drawn already, and
+    once more would make all steps, good and bad, look alike.
+    """
+    return usual._replace(lowest=feedback.lowest) if isinstance(usual, Usual) else usual
+
+
+@partial(jax.jit, static_argnames="spec")
+def fit(spec: TransitionModel, model: Model, inputs: Array, heard: Array, seen: Array, key: Array) -> Model:
+    """Train for ``fits`` minibatches of the first ``seen`` rows; unchanged before the first."""
+    filled = jnp.minimum(seen, inputs.shape[0])
+    mask = (jnp.arange(inputs.shape[0]) < filled)[:, None]
+    total = jnp.maximum(filled, 1).astype(jnp.float32)
+
+    def moments(x: Array) -> tuple[Array, Array]:
+        centre = jnp.where(mask, x, 0.0).sum(0) / total
+        return centre, jnp.sqrt(jnp.where(mask, (x - centre) ** 2, 0.0).sum(0) / total)
+
+    centre, width = moments(inputs)
+    location, deviation = moments(heard)
+    width = jnp.where(width > 1e-6, width, 1.0)
+    typical = deviation[:-1].mean()
+    scale = jnp.where(typical > 1e-6, typical, 1.0)
+    model = model._replace(centre=centre, width=width, location=location, scale=scale)
+
+    def one(carry: tuple[Any, Any], k: Array) -> tuple[tuple[Any, Any], None]:
+        layers, optimiser = carry
+        drawn = jax.random.randint(k, (spec.members, spec.batch), 0, jnp.maximum(filled, 1))
+        x = _normal(model, inputs[drawn])
+        target = (heard[drawn] - location) / scale
+
+        def loss(layers: Any) -> Array:
+            out = _predict(spec, layers, model.prior, x)
+            return optax.losses.huber_loss(out, target).mean((1, 2)).sum()
+
+        return descend(spec.learning_rate, jax.grad(loss)(layers), optimiser, layers), None
+
+    carry, _ = lax.scan(one, (model.layers, model.optimiser), jax.random.split(key, spec.fits))
+    layers, optimiser = jax.tree.map(
+        lambda new, old: jnp.where(filled > 0, new, old), carry, (model.layers, model.optimiser)
+    )
+    return model._replace(layers=layers, optimiser=optimiser)

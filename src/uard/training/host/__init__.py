@@ -1,0 +1,1 @@
+"""Training loops whose environment runs on the host."""
