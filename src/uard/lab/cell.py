@@ -176,7 +176,7 @@ def plain(value: Any) -> Any:
         cls = type(value)
         held = ((f, getattr(value, f.name)) for f in _fields(cls))
         fields = {f.name: plain(v) for f, v in held if not (f.metadata.get("later") and v == f.default)}
-        return {"class": f"{cls.__module__}.{cls.__qualname__}", **fields}
+        return {"class": cls.__name__, **fields}
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
     if isinstance(value, dict):
