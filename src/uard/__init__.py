@@ -12,7 +12,7 @@ from uard._version import __version__
 
 if TYPE_CHECKING:
     from uard._checks import InvalidValueError, UnknownNameError
-    from uard.diagnosis.doctor import Diagnosis, Finding, doctor
+    from uard.diagnosis import Diagnosis, Finding, doctor
     from uard.method.abstention import Abstention
     from uard.method.mitigations import Evidence, Feedback, LearningSignal, Mitigation, RewardDiscounting
     from uard.method.uncertainty import sigma_human, sigma_model
@@ -23,9 +23,9 @@ _HOME = {
     "InvalidValueError": "_checks",
     "UnknownNameError": "_checks",
     "Abstention": "method.abstention",
-    "Diagnosis": "diagnosis.doctor",
-    "Finding": "diagnosis.doctor",
-    "doctor": "diagnosis.doctor",
+    "Diagnosis": "diagnosis",
+    "Finding": "diagnosis",
+    "doctor": "diagnosis",
     "RatingLog": "ratings.readers",
     "Evidence": "method.mitigations",
     "Feedback": "method.mitigations",

@@ -9,7 +9,7 @@ import pytest
 
 import uard.envs  # noqa: F401  (registers ids)
 from uard import InvalidValueError, RatingLog, doctor
-from uard.diagnosis.doctor import CODES, PRINTED, filtered
+from uard.diagnosis import CODES, PRINTED, filtered
 from uard.method.mitigations import named
 from uard.ratings import readers as logs
 

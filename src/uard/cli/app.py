@@ -330,6 +330,7 @@ def _run(command: Run, console: Console) -> None:
     from uard.lab.execution.store import Store
     from uard.lab.result import summaries
     from uard.lab.study import results_of
+    from uard.ratings.panels import as_panel
 
     _checks.whole("seeds", command.seeds, low=1, high=100_000)
     _check_json(command.json)
@@ -350,11 +351,11 @@ def _run(command: Run, console: Console) -> None:
         environment,
         names.mitigation_named(command.mitigation, names.settings(command.set_mitigation, "--set-mitigation")),
         agent,
-        command.panel,
+        as_panel(command.panel),
         noise,
         command.rated,
         command.episodes,
-        feedback=names.feedback(command.feedback, agent, environment),
+        rating_model=names.rating_model(command.feedback, agent, environment),
         steps=command.steps,
         query=command.query,
     )
@@ -383,7 +384,7 @@ def _run(command: Run, console: Console) -> None:
         from rich.console import Console
         from rich.table import Table
 
-        title = f"{command.environment} / {command.agent} / {command.mitigation} / {cell.panel}, {len(seeds)} seeds"
+        title = f"{command.environment} / {command.agent} / {command.mitigation} / {command.panel}, {len(seeds)} seeds"
         table = Table("metric", "mean", "sd", "95 % interval", "IQM", title=title)
         for name, s in metrics.items():
             interval = f"{s.ci95[0]:.3f} .. {s.ci95[1]:.3f}"
