@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,13 +23,13 @@ from jax import Array, lax
 from uard import _checks
 from uard.agents import networks
 from uard.agents.networks import Ensemble, Layer, Network, Weights
-from uard.agents.off_policy import Backup, RewardFn, ScoreFn, Transitions, UpdateInfo
+from uard.agents.off_policy import Backup, OffPolicy, RewardFn, ScoreFn, Transitions, UpdateInfo
 
 LOG_TEMPERATURES = (-10.0, 3.0)  # beyond them Adam would only wind up
 
 
 @dataclass(frozen=True)
-class SoftActorCritic:
+class SoftActorCritic(OffPolicy):
     """A policy that climbs the lowest of several critics, and is paid for staying random.
 
     Attributes:
@@ -50,8 +50,6 @@ class SoftActorCritic:
         warmup: Steps before the first update.
         bootstrap: Chance that a critic learns from a transition.
     """
-
-    family: ClassVar[str] = "replay"
 
     network: Network = field(default_factory=Network)
     ensemble: Ensemble = field(default=Ensemble("full", 2, 0.0))

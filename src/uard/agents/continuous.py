@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from jax import Array, lax
 
 from uard import _checks
 from uard.agents import networks
+from uard.agents.base import Agent, Family
 from uard.agents.actor_critic import LOG_TEMPERATURES, Trained, gradient_similarity, polyak, temperature_loss
 from uard.agents.heads import HALF_LOG_TAU, Normal
 from uard.agents.networks import Ensemble, Layer, Network, Weights
@@ -35,8 +36,9 @@ CQL_ACTIONS = 4  # drawn from the policy, and as many uniformly
 UCB_ACTIONS = 8
 
 
+@final
 @dataclass(frozen=True)
-class ContinuousActorCritic:
+class ContinuousActorCritic(Agent):
     """A squashed normal policy that climbs its critics, and is paid for staying random.
 
     Attributes:
@@ -58,7 +60,7 @@ class ContinuousActorCritic:
         bootstrap: Chance that a critic learns from a transition.
     """
 
-    family: ClassVar[str] = "continuous-replay"
+    family: ClassVar[Family] = "continuous-replay"
 
     network: Network = field(default=Network(256, 3e-4, 1.0))
     ensemble: Ensemble = field(default=Ensemble("full", 2, 0.0))

@@ -7,7 +7,7 @@ per member, (N, B, outputs); its mean is mu, its deviation sigma_m (A16, A17).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
@@ -40,7 +40,7 @@ class Network:
     hidden: int = 64
     learning_rate: float = 1e-3
     value_scale: float = 10.0
-    activation: Activation = field(default="relu", metadata={"later": True})
+    activation: Activation = "relu"
 
     def __post_init__(self) -> None:
         """Check the parameters."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, NamedTuple
 
 from jax import Array
 
+from uard.agents.base import Agent, Family
 from uard.agents.networks import Network
 
 Backup = Literal["greedy", "consistent"]  # which value the target takes: the best, or that of the best score
@@ -43,9 +45,8 @@ RewardFn = Callable[[Array], tuple[Any, Any]]
 ScoreFn = Callable[[Array, Array, Array], Array]
 
 
-@runtime_checkable
-class OffPolicy(Protocol):
-    """A learner from a replay buffer; its methods are pure.
+class OffPolicy(Agent):
+    """A learner from a replay buffer, with discrete actions; its methods are pure.
 
     Attributes:
         network: Gives the unit of values.
@@ -55,6 +56,7 @@ class OffPolicy(Protocol):
         bootstrap: Chance that a member learns from a transition.
     """
 
+    family: ClassVar[Family] = "replay"
     network: Network
     buffer: int
     batch: int
@@ -62,26 +64,27 @@ class OffPolicy(Protocol):
     bootstrap: float
 
     @property
+    @abstractmethod
     def members(self) -> int:
         """Number of members of the ensemble."""
-        ...
 
+    @abstractmethod
     def init(self, key: Array, features: int, actions: int) -> Any:
         """Return a fresh state: any pytree."""
-        ...
 
+    @abstractmethod
     def values(self, state: Any, observations: Array, key: Array) -> Array:
         """Return all members' values, (N, B, A), of observations (B, features)."""
-        ...
 
+    @abstractmethod
     def act(self, state: Any, observation: Array, score_fn: ScoreFn, episode: Array, key: Array) -> Array:
         """Return an exploring action for one observation (features,) in the given episode (0-based)."""
-        ...
 
+    @abstractmethod
     def greedy(self, state: Any, observation: Array, score_fn: ScoreFn, key: Array) -> Array:
         """Return the action without exploration."""
-        ...
 
+    @abstractmethod
     def update(
         self,
         state: Any,
@@ -93,4 +96,3 @@ class OffPolicy(Protocol):
         key: Array,
     ) -> tuple[Any, UpdateInfo]:
         """Learn from one batch; ``score_fn`` scores the observations after its steps, ``score_fn_here`` those before."""
-        ...

@@ -10,9 +10,10 @@ so a mitigation's ``backup`` means nothing to them; how its scores do stands at 
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from jax.flatten_util import ravel_pytree
 
 from uard import _checks
 from uard.agents import heads, networks
+from uard.agents.base import Agent, Family
 from uard.agents.heads import ActionDistribution, divergence, entropy, log_probability
 from uard.agents.networks import SINGLE, Ensemble, Layer, Network, Weights
 from uard.agents.off_policy import UpdateInfo
@@ -100,7 +102,7 @@ class Costs(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PolicyGradient:
+class PolicyGradient(Agent):
     """What PPO, TRPO and CPO share.
 
     Attributes:
@@ -119,7 +121,7 @@ class PolicyGradient:
             it, five of ten on the true reward and two of ten with ``uard``.
     """
 
-    family: ClassVar[str] = "rollout"
+    family: ClassVar[Family] = "rollout"
 
     network: Network = field(default_factory=Network)
     ensemble: Ensemble = field(default_factory=Ensemble)
@@ -155,10 +157,15 @@ class PolicyGradient:
 
     def init(self, key: Array, features: int, actions: int, continuous: bool = False) -> State:
         """Return fresh networks; the policy is close to uniform, or to a standard normal."""
+        costs, key = self._fresh_costs(key, features)
         own, critic = jax.random.split(key)
         policy = heads.init(own, self.network, features, actions, continuous)
         value = networks.init(self.ensemble, self.network, critic, features, 1)
-        return State(policy, value, self._adam().init(policy), self._adam().init(value.layers), ())
+        return State(policy, value, self._adam().init(policy), self._adam().init(value.layers), costs)
+
+    def _fresh_costs(self, key: Array, features: int) -> tuple[Any, Array]:
+        """Return what an agent keeps of costs, nothing for one that counts none, and a key for the rest."""
+        return (), key
 
     def act(self, state: State, observations: Array, key: Array) -> Array:
         """Draw an action for each of (B, features) observations; continuous ones have no bounds."""
@@ -172,9 +179,9 @@ class PolicyGradient:
         """Return all members' values (N, B) of observations (B, features)."""
         return networks.values(self.ensemble, self.network, state.value, observations, key)[..., 0]
 
+    @abstractmethod
     def update(self, state: State, experience: Experience, key: Array) -> tuple[State, UpdateInfo]:
         """Learn from one rollout."""
-        raise NotImplementedError
 
     def _adam(self) -> optax.GradientTransformation:
         adam = optax.adam(self.network.learning_rate)
@@ -238,6 +245,7 @@ class PolicyGradient:
         return Weights(layers, weights.prior), optimiser, UpdateInfo(losses.sum(), largest.max())
 
 
+@final
 @dataclass(frozen=True)
 class PPO(PolicyGradient):
     """Proximal policy optimisation.
@@ -282,8 +290,8 @@ class PPO(PolicyGradient):
 
 
 @dataclass(frozen=True)
-class TRPO(PolicyGradient):
-    """Trust-region policy optimisation; the critic is fitted by Adam after the policy's step.
+class TrustRegion(PolicyGradient):
+    """What TRPO and CPO share: a step of the policy within a trust region; the critic is fitted by Adam after it.
 
     Attributes:
         delta: Largest mean KL divergence of the new policy from the old one (nats), > 0 (E11).
@@ -307,6 +315,12 @@ class TRPO(PolicyGradient):
         _checks.whole("conjugate_steps", self.conjugate_steps, low=1, high=1000)
         _checks.whole("backtracks", self.backtracks, low=1, high=1000)
         _checks.number("shrink", self.shrink, low=0, high=0.99, open_low=True)
+
+
+@final
+@dataclass(frozen=True)
+class TRPO(TrustRegion):
+    """Trust-region policy optimisation."""
 
     def update(self, state: State, experience: Experience, key: Array) -> tuple[State, UpdateInfo]:
         """Take one step of the policy, then fit the critic."""
@@ -336,8 +350,9 @@ class TRPO(PolicyGradient):
         return shape(line_search(theta, step, accept, self.backtracks, self.shrink))
 
 
+@final
 @dataclass(frozen=True)
-class CPO(TRPO):
+class CPO(TrustRegion):
     """Constrained policy optimisation: TRPO that keeps the cost of an episode within a budget.
 
     WARNING: with ``oracle`` (the default) the cost of a step is the HIDDEN TRUTH, whether the step was a hack. This is
@@ -366,14 +381,13 @@ class CPO(TRPO):
         """Whether the loop has to tell which steps were hacks."""
         return self.oracle
 
-    def init(self, key: Array, features: int, actions: int, continuous: bool = False) -> State:
-        """Return fresh networks; the cost critic expects none."""
+    def _fresh_costs(self, key: Array, features: int) -> tuple[Any, Array]:
+        """Return a cost critic that expects no costs."""
         own, other = jax.random.split(key)
         weights = networks.init(SINGLE, self.network, other, features, 1)
         last = jax.tree.map(jnp.zeros_like, weights.layers[-1])
         weights = Weights((*weights.layers[:-1], last), None)
-        costs = Costs(weights, self._adam().init(weights.layers), jnp.float32(0.0), jnp.float32(0.0))
-        return super().init(own, features, actions, continuous)._replace(costs=costs)
+        return Costs(weights, self._adam().init(weights.layers), jnp.float32(0.0), jnp.float32(0.0)), own
 
     def update(self, state: State, experience: Experience, key: Array) -> tuple[State, UpdateInfo]:
         """Take one step of the policy, then fit both critics."""

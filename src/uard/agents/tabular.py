@@ -7,19 +7,21 @@ its protocol and never sees the true reward.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from uard import _checks
+from uard.agents.base import Agent, Family
 from uard.method import uncertainty
 from uard.method.abstention import Abstention
 
 
+@final
 @dataclass(frozen=True)
-class QLearning:
+class QLearning(Agent):
     """Tabular Q-learning; the defaults are the paper's (E1-E9) where it states them.
 
     Attributes:
@@ -35,7 +37,7 @@ class QLearning:
         abstention: When to defer (A42, A43), if ever.
     """
 
-    family: ClassVar[str] = "tabular"
+    family: ClassVar[Family] = "tabular"
 
     heads: int = 5
     learning_rate: float = 0.1

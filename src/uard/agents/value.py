@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +22,11 @@ from jax import Array
 from uard import _checks
 from uard.agents import networks
 from uard.agents.networks import SINGLE, Ensemble, Network, Weights
-from uard.agents.off_policy import Backup, RewardFn, ScoreFn, Transitions, UpdateInfo
+from uard.agents.off_policy import Backup, OffPolicy, RewardFn, ScoreFn, Transitions, UpdateInfo
 
 
 @dataclass(frozen=True)
-class DeepQ:
+class DeepQ(OffPolicy):
     """Deep Q-learning with an ensemble; the defaults are DQN's and the paper's (E2-E9) where it states them.
 
     Attributes:
@@ -46,8 +46,6 @@ class DeepQ:
         ucb: SUNRISE's exploration bonus >= 0, in deviations.
         temperature: SUNRISE's temperature of backup weights >= 0; 0 weighs all alike.
     """
-
-    family: ClassVar[str] = "replay"
 
     network: Network = field(default_factory=Network)
     ensemble: Ensemble = SINGLE

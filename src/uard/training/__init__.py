@@ -1,5 +1,5 @@
-"""Training loops. Importing this package tells XLA how to compile them (see ``xla``)."""
+"""Training loops. Importing this package tells XLA how to compile and run them (see ``xla``)."""
 
-from uard.training.xla import compile_small_loops_whole
+from uard.training.xla import configure
 
-compile_small_loops_whole()
+configure()

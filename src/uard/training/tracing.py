@@ -37,6 +37,8 @@ def _register(cls: type) -> None:
 
     def unflatten(aux: tuple[Any, ...], children: Any) -> Any:
         numeric, rest = aux
+        # Past the constructor, as JAX asks of a pytree: fields may be tracers here, or anything that stands for a leaf,
+        # which the constructor's checks would refuse.
         obj, left = object.__new__(cls), iter(children)
         for name, is_n, other in zip(names, numeric, rest, strict=True):
             object.__setattr__(obj, name, next(left) if is_n else other)

@@ -1,9 +1,14 @@
-"""How XLA should compile our loops on a CPU.
+"""How XLA should compile and run our loops on a CPU. It reads all this when JAX starts, so it has to be set before.
 
-A training loop over small tables spends its time in starting kernels: about 20 a step, 0.1 us each. XLA can compile
-a small loop whole, as one native function, but by default only if it touches less than 1 KB. Raising that bound makes
-the tabular program 20 times faster (0.4 to 8 million steps a second). The bound is read when JAX starts its backend,
-so it has to be in the environment before that; loops with matrix products are never compiled that way.
+*Compile small loops whole.* A training loop over small tables spends its time in starting kernels: about 20 a step,
+0.1 us each. XLA can compile a small loop whole, as one native function, but by default only if it touches less than
+1 KB. Raising that bound makes the tabular program 20 times faster (0.4 to 8 million steps a second). Loops with matrix
+products are never compiled that way.
+
+*One thread.* XLA splits the sums of a matrix product among its threads, one per core that the process may use, and a sum
+that is split otherwise is rounded otherwise: PPO and TRPO gave other results on one core, on four and on sixteen. With
+one thread a result depends neither on the number of cores nor on whether a worker, which has one core, or the process
+itself trains. Many runs fill the cores, one process each.
 """
 
 from __future__ import annotations
@@ -15,6 +20,7 @@ from typing import Any
 
 _FLAG = "xla_backend_extra_options"
 _BOUND = "xla_cpu_small_while_loop_byte_threshold=10000000"
+_THREADS = "NPROC"  # XLA takes so many threads instead of one per core
 
 # Level 1 compiles in two thirds of the default's time and, for these loops, to no slower code.
 COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
@@ -59,19 +65,20 @@ def make_room(program: Any) -> None:
     _held.add(program)
 
 
-def compile_small_loops_whole() -> None:
-    """Set the flag, unless the user has set it; warn if JAX's backend has started without it."""
+def configure() -> None:
+    """Set both, the flag only if the user has not set it; warn if JAX has started without."""
     flags = os.environ.get("XLA_FLAGS", "")
-    if _FLAG in flags:
+    wanted = {_THREADS: "1", "XLA_FLAGS": flags if _FLAG in flags else f"{flags} --{_FLAG}={_BOUND}".strip()}
+    if all(os.environ.get(name) == value for name, value in wanted.items()):
         return
     from jax._src import xla_bridge
 
     if getattr(xla_bridge, "_backends", None):
         warnings.warn(
-            "JAX was in use before uard.training was imported; tabular training will be about ten times slower. "
-            "Import uard.training first.",
+            "JAX was in use before uard.training was imported; tabular training will be about ten times slower, and "
+            "results may differ in the last bits with the number of cores. Import uard.training first.",
             RuntimeWarning,
             stacklevel=3,
         )
         return
-    os.environ["XLA_FLAGS"] = f"{flags} --{_FLAG}={_BOUND}".strip()
+    os.environ.update(wanted)

@@ -1,0 +1,99 @@
+"""Configurations as plain data, made of registered names and values, and the keys that are made of them.
+
+A class has a name and no address, so that moving it to another module loses no result. Ours have their own names; those
+of other packages stand behind the name of their package, and can so never be mistaken for ours:
+
+    >>> type_name(dict), type_name(LookupError)
+    ('builtins/dict', 'builtins/LookupError')
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from uard import _checks
+
+FORMAT = 3  # of configurations and keys; results with keys of an older one are brought over by ``uard migrate``
+TYPE = "type"  # beside a configuration's fields, the name of its class
+
+
+def type_name(cls: type) -> str:
+    """Return the name of a class in configurations: its own if it is uard's, else ``package/Class``."""
+    package = cls.__module__.partition(".")[0]
+    return cls.__qualname__ if package == "uard" else f"{package}/{cls.__qualname__}"
+
+
+def plain(value: Any) -> Any:
+    """Turn (nested) dataclasses into dictionaries of all their fields, with the name of their class as ``type``."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        cls = type(value)
+        return {TYPE: type_name(cls), **{f.name: plain(getattr(value, f.name)) for f in _fields(cls)}}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    return value
+
+
+def key_of(config: dict[str, Any], trainer: str, version: int) -> str:
+    """Return a cell's key.
+
+    Args:
+        config: What ``plain`` made of it.
+        trainer: Name of the kind of training.
+        version: Of the code of that kind of training.
+    """
+    named = {"format": FORMAT, "trainer": [trainer, version], "cell": config}
+    text = json.dumps(named, sort_keys=True, allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def settled(name: str, value: Any) -> Any:
+    """Bring equal settings (2 and 2.0, 0.0 and -0.0, NumPy's numbers) to one form, so that their keys are equal.
+
+    Args:
+        name: Of the setting, for the error.
+        value: A setting, or a frozen dataclass of settings.
+
+    Raises:
+        InvalidValueError: a setting that cannot be part of a key.
+    """
+    if _checks.is_frozen(value):
+        return _settled_fields(name, value)
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, tuple):
+        return tuple(settled(f"{name}[{i}]", v) for i, v in enumerate(value))
+    if isinstance(value, float):
+        _checks.number(name, value)
+        return value if value else 0.0
+    if not (value is None or isinstance(value, bool | int | str)):
+        allowed = "a number, text, true, false, none, or a tuple or frozen dataclass of these"
+        raise _checks.InvalidValueError(name, value, allowed)
+    return value
+
+
+def _settled_fields(name: str, value: Any) -> Any:
+    changes = {}
+    for f in _fields(type(value)):
+        if f.name == TYPE:
+            raise _checks.InvalidValueError(f"{name}.{TYPE}", value, f"without a field named {TYPE!r}")
+        old = getattr(value, f.name)
+        new = settled(f"{name}.{f.name}", old)
+        if type(new) is int and f.type in _FLOATS:
+            new = float(new)
+        if type(new) is not type(old) or repr(new) != repr(old):
+            changes[f.name] = new
+    return dataclasses.replace(value, **changes) if changes else value
+
+
+_FLOATS = (float, "float", float | None, "float | None")  # as annotations, evaluated or not
+
+
+@cache
+def _fields(cls: type) -> tuple[dataclasses.Field[Any], ...]:
+    return dataclasses.fields(cls)

@@ -1,0 +1,25 @@
+"""How cells are trained: one trainer for each kind of training, found by what environment and agent declare."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from uard.lab.execution.trainers.base import Trainer
+from uard.lab.execution.trainers.compiled import CompiledReplay, CompiledRollout
+from uard.lab.execution.trainers.simulated import SimulatedReplay, SimulatedRollout
+from uard.lab.execution.trainers.tabular import Tabular
+
+__all__ = ["TRAINERS", "Trainer", "trainer_of"]
+
+TRAINERS: tuple[Trainer, ...] = (
+    Tabular(),
+    CompiledReplay(),
+    CompiledRollout(),
+    SimulatedReplay(),
+    SimulatedRollout(),
+)
+
+
+def trainer_of(agent: Any, environment: Any) -> Trainer | None:
+    """Return who trains such an agent in such an environment; None if that cannot be."""
+    return next((trainer for trainer in TRAINERS if trainer.serves(agent, environment)), None)
