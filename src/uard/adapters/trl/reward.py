@@ -36,7 +36,6 @@ from uard.judges.asking import Judge, JudgeError, Scale, as_scores, ask, by_name
 from uard.method.mitigations import Mitigation, uard
 from uard.ratings.stream import RewardStream
 
-
 __all__ = [
     "DiscountCancelledWarning",
     "ForgottenWarning",

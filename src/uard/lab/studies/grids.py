@@ -8,9 +8,9 @@ from uard.agents.tabular import QLearning
 from uard.envs.grids.learned_reward import LearnedRewardGrid
 from uard.envs.grids.trapgrid import TrapGrid, paper_grid
 from uard.lab.cell import Cell
+from uard.lab.studies.common import PANELS, RAW, SIZES, WALKER
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import Mitigation, named
-from uard.replication.studies.grids import PANELS, RAW, SIZES, WALKER
 
 COMPARED = (
     "raw",

@@ -12,11 +12,10 @@ from uard.envs.grids.trapgrid import paper_grid
 from uard.envs.locomotion.physics import Locomotion
 from uard.lab import registry as names
 from uard.lab.cell import Cell
+from uard.lab.studies.common import LOCOMOTION_STEPS, PANELS
 from uard.lab.studies.grids import COMPARED
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import named
-from uard.replication.studies.grids import PANELS
-from uard.replication.studies.locomotion import STANDARD
 from uard.training.feedback.rating_model import RatingModel
 
 AGENTS = ("q-learning", "ensemble-dqn", "ppo")  # the first that can work in an environment learns there
@@ -63,7 +62,7 @@ def agents() -> tuple[Row, ...]:
 def _crossed(where: str, environment: Any, name: str, agent: Any, panels: tuple[str, ...]) -> list[Row]:
     physical = isinstance(environment, Locomotion)
     feedback = None if physical or isinstance(agent, QLearning) else RatingModel()
-    steps = STANDARD.steps if physical else None
+    steps = LOCOMOTION_STEPS if physical else None
     return [
         row(
             Cell(environment, named(mitigation), agent, panel, feedback=feedback, steps=steps),

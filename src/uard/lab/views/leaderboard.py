@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 
 from uard import InvalidValueError, __version__
+from uard._support import files
 from uard.lab import registry as names
 from uard.lab import statistics
 from uard.lab.cell import plain
 from uard.lab.execution.store import Store
 from uard.lab.views.tables import number
+from uard.lab.views.templates import HERE, render
 from uard.method.mitigations import NAMED, named
 
 RAW = "raw"
@@ -177,16 +179,15 @@ def write(target: Path, store: Store) -> Path:
     Raises:
         InvalidValueError: the store is empty, or the file cannot be written.
     """
-    import jinja2
-
     these = lines(store)
     if not these:
         raise InvalidValueError("store", store.path, "one with finished cells")
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    environment.globals.update(number=number, share=share)
     every = standings(these)
-    page = environment.get_template("leaderboard.html.j2").render(
+    page = render(
+        HERE,
+        "leaderboard.html.j2",
+        number=number,
+        share=share,
         version=__version__,
         named=[s for s in every if ", " not in s.mitigation],
         varied=[s for s in every if ", " in s.mitigation],
@@ -198,11 +199,7 @@ def write(target: Path, store: Store) -> Path:
         seeds=sum(x.seeds for x in these),
         cells=len(these),
     )
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise InvalidValueError("out", str(target), f"a file that can be written ({error})") from None
+    files.write(target, page, "out")
     return target
 
 

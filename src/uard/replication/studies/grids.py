@@ -8,16 +8,13 @@ from __future__ import annotations
 from uard.agents.tabular import QLearning
 from uard.envs.grids.trapgrid import paper_grid
 from uard.lab.cell import Cell
+from uard.lab.studies.common import PANELS, RAW, SIZES, WALKER
 from uard.lab.study import Row, Study, row
 from uard.method.abstention import Abstention
 from uard.method.mitigations import Mitigation, named
 
-SIZES = (6, 8, 10)
-PANELS = ("main", "appendix")
 SINGLE = QLearning(heads=1)
 BOOTSTRAPPED = QLearning(bootstrap=0.5)
-WALKER = QLearning(heads=1, epsilon=1.0, epsilon_decay=1.0, epsilon_min=1.0)
-RAW = named("raw")
 
 # The agents that most tables compare: (label, agent, mitigation).
 HEADLINE: tuple[tuple[str, QLearning, Mitigation], ...] = (

@@ -10,9 +10,10 @@ from uard.agents.policy import PolicyGradient
 from uard.envs.locomotion.physics import Kick, Locomotion, Posture, Vibration
 from uard.lab.cell import Cell
 from uard.lab.registry import continuous_agents
+from uard.lab.studies.common import LOCOMOTION_STEPS, PANELS, RAW
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import named
-from uard.replication.studies.grids import PANELS, RAW
+from uard.replication.studies import derive
 from uard.training.feedback.transition_model import QUERIES
 
 REGIONS = {"vibration": Vibration, "posture": Posture}
@@ -62,7 +63,7 @@ class Scale:
 
 ALL = tuple(name for name in continuous_agents() if name != "cpo-oracle")
 SMOKE = Scale("smoke", 4_096, 2_560, True, ("ppo", "sac"), ("hopper",))
-STANDARD = Scale("standard", 200_000, 50_000, True, ALL)
+STANDARD = Scale("standard", LOCOMOTION_STEPS, 50_000, True, ALL)
 PAPER = Scale("paper", 1_000_000, 1_000_000, False, ALL)
 
 
@@ -254,5 +255,6 @@ def studies(scale: Scale) -> tuple[Study, ...]:
             f"A distorted reward after training in MuJoCo, {scale.name}",
             "H13-H16, G12-G15",
             distortion(scale),
+            derive=derive.reactions,
         ),
     )
