@@ -9,7 +9,7 @@ import pytest
 
 from uard import InvalidValueError
 from uard.agents.tabular import QLearning
-from uard.cli.app import main as cli
+from uard.cli import app as cli
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab import statistics
 from uard.lab.cell import Cell

@@ -10,7 +10,7 @@ import pytest
 
 from uard import InvalidValueError, LearningSignal, Mitigation
 from uard.agents.tabular import QLearning
-from uard.cli.app import main as cli
+from uard.cli import app as cli
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
 from uard.lab.execution import cluster, runner

@@ -125,7 +125,12 @@ def test_a_diverging_run_is_named_kept_out_and_leaves_its_last_good_state(tmp_pa
 def test_published_results_come_back_and_stale_ones_do_not():
     store, cell = Store(":memory:"), small()
     runner.run([(cell, s) for s in range(3)], store, workers=1)
-    study = Study("deep-baselines", "t", "", (row(cell, agent="a"), row(small(noise=0.1), agent="b")))
+    rows = row(cell, agent="a"), row(small(noise=0.1), agent="b")
+
+    def derive(cell, found):
+        return {"largest": [r.metrics()["trap_visits"] / 3 for r in found.values()]}
+
+    study = Study("deep-baselines", "t", "", rows, ("trap_visits",), derive)
     data = json.loads(json.dumps(extract((study,), store, range(3), "made so")))
     back = Published((study,), [data])
     assert [r["agent"] for r in back.rows("deep-baselines")] == ["a"]
@@ -133,6 +138,9 @@ def test_published_results_come_back_and_stale_ones_do_not():
     np.testing.assert_allclose(back.per_seed(study.rows[0], "trap_visits"), expected, rtol=1e-5)
     assert back.curves(study.rows[0], "trap_visits").shape == (3, 20 // BIN)
     assert back.derived(study.rows[0], "rating_error").shape == (3, 5)
+    np.testing.assert_allclose(back.derived(study.rows[0], "largest"), np.array(expected) / 3, rtol=1e-5)
+    assert list(data["cells"]) == [cell.key]
+    assert list(data["cells"][cell.key]["curves"]) == ["trap_visits"]
     assert back.sources[0]["command"] == "made so"
     assert back.sources[0]["commit"] == checkout()
     with pytest.raises(LookupError, match="not published"):

@@ -1,4 +1,4 @@
-"""A mitigation, an environment and an agent that uard knows as soon as this package is installed."""
+"""What uard knows as soon as this package is installed: a mitigation, an environment, an agent, a study, a section."""
 
 from __future__ import annotations
 
@@ -12,6 +12,13 @@ import numpy as np
 from uard import InvalidValueError, LearningSignal, Mitigation
 from uard.agents.value import DeepQ
 from uard.envs.tables import HiddenTruth, Ratings, Task
+from uard.lab.cell import Cell
+from uard.lab.study import Study, row
+from uard.lab.views.evidence import Evidence
+from uard.lab.views.sections import Section
+from uard.lab.views.tables import Table, full
+from uard.lab.views.templates import table
+from uard.method.mitigations import Raw, named
 from uard.ratings import panels
 
 
@@ -113,3 +120,22 @@ class SoftmaxDQN(DeepQ):
         choice, dropout = jax.random.split(key)
         mu, sigma = self.read(state, observation[None], dropout)
         return jax.random.categorical(choice, prefer(mu, sigma, observation[None])[0] / self.heat).astype(jnp.int32)
+
+
+def studies() -> dict[str, tuple[Study, ...]]:
+    """Return groups of studies by name: what ``uard reproduce bells`` runs."""
+    rivals: dict[str, Mitigation] = {"raw": Raw(), "ceiling": Ceiling(), "uard": named("uard")}
+    rows = tuple(
+        row(Cell(BellCorridor(bell=bell), mitigation), bell=bell, mitigation=name)
+        for bell in (0.5, 2.0, 8.0)
+        for name, mitigation in rivals.items()
+    )
+    return {"bells": (Study("loudness", "How loud may a bell be?", "an example", rows),)}
+
+
+def sections(evidence: Evidence) -> list[Section]:
+    """Return what joins the report; ``evidence`` holds all studies of the group ``grid``."""
+    (walker, *_) = evidence.studies["control"].rows
+    rows = (("a random walker, 6x6", full(evidence.of(walker.cell, "trap_visits"))),)
+    shown = table(Table("What nobody has to learn", ("who", "trap visits per episode"), rows))
+    return [Section("example", "An example", 200, shown, losses=("Nobody has tried uard on bells of 1000.",))]
