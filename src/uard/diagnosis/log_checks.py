@@ -140,7 +140,7 @@ def idle_raters(case: Case) -> Finding | None:
 
 def one_rater(case: Case) -> Finding | None:
     """No row has more than one rating."""
-    if not case.rated.any() or case.several().any():
+    if not case.rated.any() or case.together.any():
         return None
     far = np.abs(case.gap()) > case.unit
     kept = {o.name: share_kept(case, o, far) for o in (case.mine, case.printed)}
