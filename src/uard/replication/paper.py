@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from uard._checks import InvalidValueError
+
 SEEDS = 10  # line 894
 LAST_EPISODES = 100  # lines 924, 951
 EPISODES = 500  # line 1002
@@ -226,6 +228,24 @@ class Figure:
     line: int
     shows: str
     numbers: dict[str, Number | Stat] = field(default_factory=dict)
+
+    def number(self, name: str) -> float:
+        """Return a single number."""
+        value = self.numbers[name]
+        if isinstance(value, tuple):
+            raise InvalidValueError(name, value, "a single number")
+        return float(value)
+
+    def range(self, name: str) -> tuple[float, float]:
+        """Return both ends of a range."""
+        value = self.numbers[name]
+        if not isinstance(value, tuple):
+            raise InvalidValueError(name, value, "a range")
+        return value[0], value[1]
+
+    def stat(self, name: str) -> Stat:
+        """Return mean and standard deviation."""
+        return Stat(*self.range(name))
 
 
 FIGURES = {

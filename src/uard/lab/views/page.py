@@ -230,7 +230,9 @@ def _check(c: audit.Check) -> dict[str, str]:
         "question": c.question,
         "printed_text": text(c.paper),
         "recomputed_text": text(c.recomputed),
+        "judgement": f"{c.judgement.verdict} ({c.judgement.count})" if c.judgement else "nothing claimed",
         "verdict": c.verdict,
+        "parts": audit.one_by_one([*c.parts, *(o for o in c.found if o.opinion)]),
     }
 
 
