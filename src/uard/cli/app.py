@@ -623,6 +623,7 @@ def _log(command: Doctor) -> Any:
     import uard.envs  # noqa: F401  (registers ids)
     from uard.lab import registry as names
     from uard.ratings import readers as logs
+    from uard.ratings import rollout
 
     if Path(command.log).suffix.lower() in logs.FORMATS or Path(command.log).exists():
         return logs.read(command.log, command.reward, command.ratings or None)
@@ -635,7 +636,7 @@ def _log(command: Doctor) -> Any:
     except TypeError as error:  # an unknown keyword
         raise _invalid("set", dict(settings), f"keywords of {command.log} ({error})") from None
     with env:
-        return logs.rollout(env, command.steps, command.seed)
+        return rollout.rollout(env, command.steps, command.seed)
 
 
 def _best_of_n(command: BestOfN, console: Console) -> None:
