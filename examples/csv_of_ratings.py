@@ -9,7 +9,7 @@ import csv
 import numpy as np
 
 from uard import doctor
-from uard.diagnosis.doctor import filtered
+from uard.diagnosis import filtered
 from uard.ratings import readers as logs
 
 random = np.random.default_rng(0)

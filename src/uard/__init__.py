@@ -12,21 +12,21 @@ from uard._version import __version__
 
 if TYPE_CHECKING:
     from uard._checks import InvalidValueError, UnknownNameError
-    from uard.diagnosis.doctor import Diagnosis, Finding, doctor
+    from uard.diagnosis import Diagnosis, Finding, doctor
     from uard.method.abstention import Abstention
     from uard.method.mitigations import Evidence, Feedback, LearningSignal, Mitigation, RewardDiscounting
     from uard.method.uncertainty import sigma_human, sigma_model
     from uard.method.weights import ReliabilityFilter, discount, total_uncertainty
-    from uard.ratings.readers import RatingLog
+    from uard.ratings.log import RatingLog
 
 _HOME = {
     "InvalidValueError": "_checks",
     "UnknownNameError": "_checks",
     "Abstention": "method.abstention",
-    "Diagnosis": "diagnosis.doctor",
-    "Finding": "diagnosis.doctor",
-    "doctor": "diagnosis.doctor",
-    "RatingLog": "ratings.readers",
+    "Diagnosis": "diagnosis",
+    "Finding": "diagnosis",
+    "doctor": "diagnosis",
+    "RatingLog": "ratings.log",
     "Evidence": "method.mitigations",
     "Feedback": "method.mitigations",
     "LearningSignal": "method.mitigations",

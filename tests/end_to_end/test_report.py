@@ -54,8 +54,10 @@ def test_the_ledger_answers_every_claim_once(made):
     for e in entries:
         assert e["verdict"] in VERDICTS
         assert len(e["why"]) > 10
+        assert e["parts"]
+        assert bool(e["count"]) == (e["verdict"] != "cannot be tested")
         assert len(e["statement"]) > 10
-        assert e["ran"]
+        assert e["source"]
         assert e["ours"]
         assert not NOT_A_NUMBER.search(e["ours"]), e
         assert (e["ours"] == "-") <= (e["verdict"] == "cannot be tested"), e

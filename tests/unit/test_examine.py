@@ -77,7 +77,7 @@ def test_what_a_random_action_would_do_leaves_no_trace_in_the_walk(monkeypatch):
     assert np.isfinite(found["perturbed"]).all()
 
 
-class Judge(SimpleNamespace):
+class RewardFn(SimpleNamespace):
     """A judge of places 0 to 99 in a world of reward 1 and discount 0.5, with given values and doubts."""
 
     job = SimpleNamespace(seed=0, agent=SimpleNamespace(gamma=0.5))
@@ -102,9 +102,9 @@ def test_the_warning_knows_wrong_values_and_states_that_were_never_visited():
     moved = Moved(np.zeros((100, 2)), np.ones(100), no, no, np.ones(100), no, np.ones(100))
     walked = examine.Walked(at, np.zeros((100, 1)), moved)
     for doubts, expected in ((wrong * 1.0, 1.0), (1.0 - wrong, 0.0), (np.ones(100), 0.5)):
-        _, error = examine._warning(Judge(values=values, doubts=doubts), walked)
+        _, error = examine._warning(RewardFn(values=values, doubts=doubts), walked)
         assert error == pytest.approx(expected)
-    thrown, _ = examine._warning(Judge(values=values, doubts=np.zeros(100)), walked)
+    thrown, _ = examine._warning(RewardFn(values=values, doubts=np.zeros(100)), walked)
     assert 0.6 < thrown < 0.9, "half are thrown off sideways, where it is in doubt; along the places it is not"
 
 

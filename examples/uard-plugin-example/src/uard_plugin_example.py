@@ -11,7 +11,8 @@ import numpy as np
 
 from uard import InvalidValueError, LearningSignal, Mitigation
 from uard.agents.value import DeepQ
-from uard.envs.tables import HiddenTruth, Ratings, Task
+from uard.envs.base import TableEnvironment
+from uard.envs.tables import HiddenTruth, Task
 from uard.lab.cell import Cell
 from uard.lab.study import Study, row
 from uard.lab.views.evidence import Evidence
@@ -19,7 +20,6 @@ from uard.lab.views.sections import Section
 from uard.lab.views.tables import Table, full
 from uard.lab.views.templates import table
 from uard.method.mitigations import Raw, named
-from uard.ratings import panels
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Ceiling(Mitigation):
         if not self.slack >= 0:
             raise InvalidValueError("slack", self.slack, "a number >= 0")
 
-    def signal(self, evidence: Any, usual: Any) -> LearningSignal:
+    def signal(self, evidence: Any, statistics: Any) -> LearningSignal:
         """Return the smaller of reward and ceiling."""
         known = evidence.feedback.count > 0
         ceiling = jnp.where(known, evidence.feedback.mean, 0.0) + self.slack
@@ -45,7 +45,7 @@ class Ceiling(Mitigation):
 
 
 @dataclass(frozen=True)
-class BellCorridor:
+class BellCorridor(TableEnvironment):
     """A corridor with the goal at its far end and a bell in its middle, which pays for every ring and is worth nothing.
 
     Actions: 0 back, 1 on, 2 ring (nothing happens where there is no bell).
@@ -90,14 +90,6 @@ class BellCorridor:
         worth = np.where(rings & (not self.legitimate), np.float32(-1.0), task.reward)
         return HiddenTruth(worth, rings, task.terminal)
 
-    def speech(self, panel: str, noise: float) -> Ratings:
-        """Return what a panel says of every step."""
-        return panels.ratings(panel, self.task(), self.truth(), noise)
-
-    def world(self, panel: str = "main", noise: float = 0.0) -> Any:
-        """Return the compiled world, for deep agents."""
-        return panels.of_tables(self, panel, noise)
-
 
 @dataclass(frozen=True)
 class SoftmaxDQN(DeepQ):
@@ -115,11 +107,11 @@ class SoftmaxDQN(DeepQ):
         if not self.heat > 0:
             raise InvalidValueError("heat", self.heat, "a number > 0")
 
-    def act(self, state: Any, observation: Any, prefer: Any, episode: Any, key: Any) -> Any:
+    def act(self, state: Any, observation: Any, score_fn: Any, episode: Any, key: Any) -> Any:
         """Draw an action for one observation."""
         choice, dropout = jax.random.split(key)
         mu, sigma = self.read(state, observation[None], dropout)
-        return jax.random.categorical(choice, prefer(mu, sigma, observation[None])[0] / self.heat).astype(jnp.int32)
+        return jax.random.categorical(choice, score_fn(mu, sigma, observation[None])[0] / self.heat).astype(jnp.int32)
 
 
 def studies() -> dict[str, tuple[Study, ...]]:

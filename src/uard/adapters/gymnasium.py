@@ -21,7 +21,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from uard.adapters.steps import INFO, Doubt, Key, Ratings, Steps, natural_key, rows_of, subset
+from uard.adapters.steps import INFO, KeyFn, RatingsFn, SigmaFn, Steps, natural_key, rows_of, subset
 from uard.method.abstention import Abstention
 from uard.method.mitigations import Mitigation
 from uard.ratings.stream import RewardStream
@@ -30,9 +30,9 @@ from uard.ratings.stream import RewardStream
 def _steps(
     env: Any,
     mitigation: Mitigation | None,
-    ratings: Ratings | None,
-    sigma_m: Doubt | None,
-    key: Key | None,
+    ratings: RatingsFn | None,
+    sigma_m: SigmaFn | None,
+    key: KeyFn | None,
     abstention: Abstention | None,
     single: str,
 ) -> Steps:
@@ -61,9 +61,9 @@ class ReliabilityWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.
         env: gymnasium.Env[Any, Any],
         mitigation: Mitigation | None = None,
         *,
-        ratings: Ratings | None = None,
-        sigma_m: Doubt | None = None,
-        key: Key | None = None,
+        ratings: RatingsFn | None = None,
+        sigma_m: SigmaFn | None = None,
+        key: KeyFn | None = None,
         abstention: Abstention | None = None,
     ):
         """Wrap an environment.
@@ -98,22 +98,22 @@ class ReliabilityWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.
         Raises:
             InvalidValueError: for a reward or ratings that no training should be fed.
         """
-        following, reward, terminated, truncated, info = super().step(action)
+        next_observation, reward, terminated, truncated, info = super().step(action)
         found = info.get("ratings")
         out = self.steps.filter(
             _batch(self._observation),
             _batch(action),
-            _batch(following),
+            _batch(next_observation),
             np.array([reward], float),
             None if found is None else rows_of({0: found}, 1),
         )
         filtered = float(out.reward[0])
-        self._observation = following
+        self._observation = next_observation
         self._returns += float(out.raw[0]), filtered
         info = info | {name: getattr(out, where)[0].item() for name, where in INFO.items()}
         if terminated or truncated:
             info |= {"raw_return": float(self._returns[0]), "filtered_return": float(self._returns[1])}
-        return following, filtered, terminated, truncated, info
+        return next_observation, filtered, terminated, truncated, info
 
 
 class VectorReliabilityWrapper(gymnasium.vector.VectorWrapper, gymnasium.utils.RecordConstructorArgs):
@@ -130,9 +130,9 @@ class VectorReliabilityWrapper(gymnasium.vector.VectorWrapper, gymnasium.utils.R
         env: gymnasium.vector.VectorEnv[Any, Any, Any],
         mitigation: Mitigation | None = None,
         *,
-        ratings: Ratings | None = None,
-        sigma_m: Doubt | None = None,
-        key: Key | None = None,
+        ratings: RatingsFn | None = None,
+        sigma_m: SigmaFn | None = None,
+        key: KeyFn | None = None,
         abstention: Abstention | None = None,
     ):
         """Wrap vector environments; see ``ReliabilityWrapper``."""
@@ -161,9 +161,9 @@ class VectorReliabilityWrapper(gymnasium.vector.VectorWrapper, gymnasium.utils.R
             InvalidValueError: for a reward or ratings that no training should be fed; names the environment.
         """
         n = self.num_envs
-        following, rewards, terminated, truncated, info = super().step(actions)
+        next_observation, rewards, terminated, truncated, info = super().step(actions)
         info, ended = dict(info), np.asarray(terminated) | np.asarray(truncated)
-        reached = self._reached(following, ended, info)
+        reached = self._reached(next_observation, ended, info)
         found = rows_of(_reported(info, ended if self._mode is AutoresetMode.SAME_STEP else np.zeros(n, bool)), n)
         real = np.flatnonzero(~self._resetting)
         filtered = np.array(rewards, float)
@@ -186,14 +186,16 @@ class VectorReliabilityWrapper(gymnasium.vector.VectorWrapper, gymnasium.utils.R
                 _put(info, name, over, returns[over], n)
             self._returns[:, over] = 0.0
         self._resetting = ended if self._mode is AutoresetMode.NEXT_STEP else np.zeros(n, bool)
-        self._observation = following
-        return following, filtered, terminated, truncated, info
+        self._observation = next_observation
+        return next_observation, filtered, terminated, truncated, info
 
-    def _reached(self, following: Any, ended: np.ndarray, info: dict[str, Any]) -> Any:
+    def _reached(self, next_observation: Any, ended: np.ndarray, info: dict[str, Any]) -> Any:
         """Return what the steps led to, before any reset."""
         if self._mode is not AutoresetMode.SAME_STEP or not ended.any() or self.steps.ratings is None:
-            return following
-        rows = [info["final_obs"][i] if ended[i] else subset(following, np.array(i)) for i in range(self.num_envs)]
+            return next_observation
+        rows = [
+            info["final_obs"][i] if ended[i] else subset(next_observation, np.array(i)) for i in range(self.num_envs)
+        ]
         space = self.single_observation_space
         out = gymnasium.vector.utils.create_empty_array(space, self.num_envs)
         return gymnasium.vector.utils.concatenate(space, rows, out)

@@ -10,7 +10,7 @@ known now, and by the critics as they are now::
 
     DQN("MlpPolicy", env, replay_buffer_class=ReliabilityReplayBuffer).learn(100_000, callback=ReliabilityCallback())
 
-Ratings come from ``info["ratings"]`` or from a callable. ``rollout/ep_rew_mean`` is what the Monitor saw: the raw
+RatingsFn come from ``info["ratings"]`` or from a callable. ``rollout/ep_rew_mean`` is what the Monitor saw: the raw
 return where it is inside ``ReliabilityVecEnv``, as ``make_vec_env`` has it. The callback logs ``uard/raw_return`` and
 ``uard/filtered_return`` beside each other.
 """
@@ -24,9 +24,10 @@ from typing import Any
 import numpy as np
 
 from uard import _checks
-from uard.adapters.steps import INFO, Doubt, Key, Ratings, Steps, natural_key, rows_of
+from uard.adapters.steps import INFO, KeyFn, RatingsFn, SigmaFn, Steps, natural_key, rows_of
 from uard.method.abstention import Abstention
 from uard.method.mitigations import Mitigation
+from uard.ratings.aggregate import aggregate
 from uard.ratings.stream import Filtered, RewardStream
 
 try:
@@ -54,9 +55,9 @@ class ReliabilityVecEnv(VecEnvWrapper):
         venv: VecEnv,
         mitigation: Mitigation | None = None,
         *,
-        ratings: Ratings | None = None,
-        sigma_m: Doubt | None = None,
-        key: Key | None = None,
+        ratings: RatingsFn | None = None,
+        sigma_m: SigmaFn | None = None,
+        key: KeyFn | None = None,
         abstention: Abstention | None = None,
     ):
         """Wrap environments; the arguments are those of ``uard.adapters.gymnasium.ReliabilityWrapper``.
@@ -90,8 +91,8 @@ class ReliabilityVecEnv(VecEnvWrapper):
         Raises:
             InvalidValueError: for a reward or ratings that no training should be fed; names the environment.
         """
-        following, rewards, dones, infos = self.venv.step_wait()
-        reached = following if self.steps.ratings is None else _reached(following, dones, infos)
+        next_observation, rewards, dones, infos = self.venv.step_wait()
+        reached = next_observation if self.steps.ratings is None else _reached(next_observation, dones, infos)
         found = rows_of({i: x["ratings"] for i, x in enumerate(infos) if x.get("ratings") is not None}, len(infos))
         out = self.steps.filter(self._observation, self._actions, reached, np.asarray(rewards, float), found)
         self.latest = out
@@ -104,8 +105,8 @@ class ReliabilityVecEnv(VecEnvWrapper):
             if dones[i]:
                 info["raw_return"], info["filtered_return"] = self._returns[:, i].tolist()
                 self._returns[:, i] = 0.0
-        self._observation = following
-        return following, out.reward.astype(np.float32), dones, infos
+        self._observation = next_observation
+        return next_observation, out.reward.astype(np.float32), dones, infos
 
     def save(self, path: str | Path) -> None:
         """Write what was learned of rewards and raters to a file."""
@@ -132,26 +133,26 @@ def _refuse_normalised(venv: Any) -> None:
         venv = venv.venv
 
 
-def _reached(following: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> Any:
+def _reached(next_observation: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> Any:
     """Return what the steps led to, before any reset."""
     if not dones.any():
-        return following
-    if isinstance(following, dict):
+        return next_observation
+    if isinstance(next_observation, dict):
         part = [
             {"terminal_observation": i["terminal_observation"]} if "terminal_observation" in i else {} for i in infos
         ]
         return {
             name: _reached(x, dones, [{k: v[name] for k, v in i.items()} for i in part])
-            for name, x in following.items()
+            for name, x in next_observation.items()
         }
-    reached = np.array(following)
+    reached = np.array(next_observation)
     for i in np.flatnonzero(dones):
         reached[i] = infos[i]["terminal_observation"]
     return reached
 
 
 class ReliabilityReplayBuffer(ReplayBuffer):
-    """Keeps raw rewards and what was said of them, and filters whenever it is sampled.
+    """Keeps raw rewards and their ratings, and filters whenever it is sampled.
 
     For ``replay_buffer_class=`` of DQN, SAC, TD3 and DDPG with one-step targets and observations that are arrays; the
     options go into ``replay_buffer_kwargs``. ``save_replay_buffer`` keeps all of it.
@@ -165,9 +166,9 @@ class ReliabilityReplayBuffer(ReplayBuffer):
         self,
         *arguments: Any,
         mitigation: Mitigation | None = None,
-        ratings: Ratings | None = None,
-        sigma_m: Doubt | None = None,
-        key: Key | None = None,
+        ratings: RatingsFn | None = None,
+        sigma_m: SigmaFn | None = None,
+        key: KeyFn | None = None,
         **options: Any,
     ):
         """Build an empty buffer; see ``ReplayBuffer`` and ``uard.adapters.gymnasium.ReliabilityWrapper``."""
@@ -177,9 +178,9 @@ class ReliabilityReplayBuffer(ReplayBuffer):
         self.latest: Filtered | None = None
         size = self.buffer_size, self.n_envs
         self._raw = np.zeros(size)
-        # With keys the place of what is known of a step, without what was said of it.
+        # With keys the place of what is known of a step's state-action, without keys the step's own ratings.
         self._slots = np.zeros(size if key else (0, 0), np.int64)
-        self._said = np.zeros((0, 0, 5) if key else (*size, 5))
+        self._ratings = np.full((0, 0, 1) if key else (*size, 1), np.nan)
 
     def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:
         """Store one step of every environment, with the ratings in its ``info``.
@@ -194,26 +195,36 @@ class ReliabilityReplayBuffer(ReplayBuffer):
         states, acts = obs.reshape(self.n_envs, *self.obs_shape), action.reshape(self.n_envs, self.action_dim)
         if self.steps.key is not None:
             states, acts = _numbered(states), _numbered(acts)
-        said = self.steps.said(states, acts, next_obs, rewards, found)
-        slots, own = self.steps.stream.hear(rewards, said, self.steps.keys(states, acts, self.n_envs))
+        ratings = self.steps.ratings_of(states, acts, next_obs, rewards, found)
+        slots = self.steps.stream.observe(rewards, ratings, self.steps.keys(states, acts, self.n_envs)).slots
         super().add(obs, next_obs, action, reward, done, infos)
         self._raw[place] = rewards
         if slots is None:
-            self._said[place] = own
+            self._keep_ratings(place, ratings)
         else:
             self._slots[place] = slots
 
+    def _keep_ratings(self, place: int, ratings: Any) -> None:
+        """Write the ratings (E, K) of one step of all environments down; None is no rating."""
+        self._ratings[place] = np.nan
+        if ratings is not None:
+            more = ratings.shape[1] - self._ratings.shape[2]
+            if more > 0:
+                self._ratings = np.pad(self._ratings, ((0, 0), (0, 0), (0, more)), constant_values=np.nan)
+            self._ratings[place, :, : ratings.shape[1]] = ratings
+
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Any:
         raw = self._raw[batch_inds].reshape(-1)
-        if self.steps.key is None:
-            rows = self._said[batch_inds].reshape(-1, 5)
+        keyed, stream = self.steps.key is not None, self.steps.stream
+        if keyed:
+            known = stream.known(self._slots[batch_inds].reshape(-1))
         else:
-            rows = self.steps.stream.rows(self._slots[batch_inds].reshape(-1))
-        doubt = None
+            known = aggregate(self._ratings[batch_inds].reshape(len(raw), -1), raw, ddof=stream.ddof)
+        sigma_m = None
         if self.steps.sigma_m is not None:
             states = self._normalize_obs(self.observations[batch_inds].reshape(-1, *self.obs_shape), env)
-            doubt = self.steps.sigma_m(states, self.actions[batch_inds].reshape(-1, self.action_dim))
-        self.latest = self.steps.stream.filter(raw, rows, doubt)
+            sigma_m = self.steps.sigma_m(states, self.actions[batch_inds].reshape(-1, self.action_dim))
+        self.latest = stream.filter(raw, known, sigma_m, keyed=keyed)
         self.rewards[batch_inds] = self.latest.reward.reshape(-1, self.n_envs)
         return super()._get_samples(batch_inds, env)
 

@@ -12,12 +12,12 @@ import numpy as np
 from uard import _checks
 from uard.ratings.stream import Filtered, RewardStream
 
-Ratings = Callable[[Any, Any, Any, np.ndarray], Any]
+RatingsFn = Callable[[Any, Any, Any, np.ndarray], Any]
 """(observations, actions, next observations, observed rewards), all (B, ...) -> ratings (B, K), NaN where missing."""
-Doubt = Callable[[Any, Any], Any]
+SigmaFn = Callable[[Any, Any], Any]
 """(observations, actions), both (B, ...) -> sigma_m (B,). If it has ``update(observations, actions, rewards)``, it is
 told of every step afterwards."""
-Key = Callable[[Any, Any], Hashable]
+KeyFn = Callable[[Any, Any], Hashable]
 """(observation, action) of one step -> what tells it from other state-actions."""
 
 INFO = {
@@ -43,35 +43,40 @@ class Steps:
     """
 
     stream: RewardStream = field(default_factory=RewardStream)
-    ratings: Ratings | None = None
-    sigma_m: Doubt | None = None
-    key: Key | None = None
+    ratings: RatingsFn | None = None
+    sigma_m: SigmaFn | None = None
+    key: KeyFn | None = None
 
     def keys(self, observations: Any, actions: Any, count: int) -> list[Hashable] | None:
         """Return the keys of a batch, or None where all steps differ."""
         return None if self.key is None else [self.key(_row(observations, i), actions[i]) for i in range(count)]
 
-    def said(self, observations: Any, actions: Any, following: Any, rewards: np.ndarray, info: Any) -> Any:
+    def ratings_of(
+        self, observations: Any, actions: Any, next_observations: Any, rewards: np.ndarray, info: Any
+    ) -> Any:
         """Return the ratings of a batch, from the callable or as found in ``info``."""
         if self.ratings is None:
             return info
-        said = _checks.as_numpy("ratings(...)", self.ratings(observations, actions, following, rewards))
-        if said.ndim != 2 or len(said) != len(rewards):
-            raise _checks.InvalidValueError("ratings(...).shape", said.shape, f"({len(rewards)}, K), one row per step")
-        return said
+        ratings = _checks.as_numpy("ratings(...)", self.ratings(observations, actions, next_observations, rewards))
+        if ratings.ndim != 2 or len(ratings) != len(rewards):
+            allowed = f"({len(rewards)}, K), one row per step"
+            raise _checks.InvalidValueError("ratings(...).shape", ratings.shape, allowed)
+        return ratings
 
-    def filter(self, observations: Any, actions: Any, following: Any, rewards: np.ndarray, info: Any) -> Filtered:
+    def filter(
+        self, observations: Any, actions: Any, next_observations: Any, rewards: np.ndarray, info: Any
+    ) -> Filtered:
         """Filter a batch of steps; ``info`` holds the ratings (B, K) that came with it, or is None."""
-        said = self.said(observations, actions, following, rewards, info)
-        doubt = None if self.sigma_m is None else self.sigma_m(observations, actions)
-        out = self.stream(rewards, said, doubt, self.keys(observations, actions, len(rewards)))
+        ratings = self.ratings_of(observations, actions, next_observations, rewards, info)
+        sigma_m = None if self.sigma_m is None else self.sigma_m(observations, actions)
+        out = self.stream(rewards, ratings, sigma_m, self.keys(observations, actions, len(rewards)))
         update = getattr(self.sigma_m, "update", None)
         if update is not None:
             update(observations, actions, rewards)
         return out
 
 
-def natural_key(observation_space: gymnasium.Space[Any], action_space: gymnasium.Space[Any]) -> Key | None:
+def natural_key(observation_space: gymnasium.Space[Any], action_space: gymnasium.Space[Any]) -> KeyFn | None:
     """Return the key of a world of numbered states and actions; None for all others."""
     discrete = gymnasium.spaces.Discrete
     return _numbers if isinstance(observation_space, discrete) and isinstance(action_space, discrete) else None

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from jax import Array, lax
 from uard import _checks
 from uard.agents import networks
 from uard.agents.networks import Ensemble, Layer, Network, Weights
-from uard.agents.off_policy import Backup, Batch, Judge, Prefer, Watched
+from uard.agents.off_policy import Backup, RewardFn, ScoreFn, Transitions, UpdateInfo
 
 LOG_TEMPERATURES = (-10.0, 3.0)  # beyond them Adam would only wind up
 
@@ -50,6 +50,8 @@ class SoftActorCritic:
         warmup: Steps before the first update.
         bootstrap: Chance that a critic learns from a transition.
     """
+
+    family: ClassVar[str] = "replay"
 
     network: Network = field(default_factory=Network)
     ensemble: Ensemble = field(default=Ensemble("full", 2, 0.0))
@@ -104,11 +106,11 @@ class SoftActorCritic:
         """Return mu and sigma_m of the critics, (B, A) each."""
         return networks.mean_and_deviation(self.values(state, observations, key))
 
-    def act(self, state: State, observation: Array, prefer: Prefer, episode: Array, key: Array) -> Array:
+    def act(self, state: State, observation: Array, score_fn: ScoreFn, episode: Array, key: Array) -> Array:
         """Return a draw from the policy, which has learned what the mitigation prefers."""
         return jax.random.categorical(key, self.policy(state, observation[None])[0]).astype(jnp.int32)
 
-    def greedy(self, state: State, observation: Array, prefer: Prefer, key: Array) -> Array:
+    def greedy(self, state: State, observation: Array, score_fn: ScoreFn, key: Array) -> Array:
         """Return the policy's likeliest action."""
         return jnp.argmax(self.policy(state, observation[None])[0]).astype(jnp.int32)
 
@@ -120,35 +122,37 @@ class SoftActorCritic:
     def update(
         self,
         state: State,
-        batch: Batch,
-        judge: Judge,
-        prefer: Prefer,
-        prefer_here: Prefer,
+        batch: Transitions,
+        reward_fn: RewardFn,
+        score_fn: ScoreFn,
+        score_fn_here: ScoreFn,
         backup: Backup,
         key: Array,
-    ) -> tuple[State, Watched]:
+    ) -> tuple[State, UpdateInfo]:
         """Take one step of Adam on critics, actor and temperature together."""
         drop, drop_next, drop_read = jax.random.split(key, 3)
         ensemble, network, scale = self.ensemble, self.network, self.network.value_scale
         dropout = ensemble.kind == "dropout" and ensemble.members > 1
         temperature = jnp.exp(state.trained.log_temperature)
-        following = networks.values(ensemble, network, Weights(state.target, state.prior), batch.following, drop_next)
-        log_next = self.policy(state, batch.following)
-        value = soft_value(lowest(following), log_next, scale * temperature)
-        aim = self.target_entropy(state.updates, following.shape[-1])
+        next_values = networks.values(
+            ensemble, network, Weights(state.target, state.prior), batch.next_observation, drop_next
+        )
+        log_next = self.policy(state, batch.next_observation)
+        value = soft_value(lowest(next_values), log_next, scale * temperature)
+        aim = self.target_entropy(state.updates, next_values.shape[-1])
 
         # Critics, actor and temperature share no parameter and Adam works on each number alone, so one gradient of
         # the sum is what three optimisers would take. All three see the networks before the step.
         def loss(trained: Trained) -> tuple[Array, Array]:
             weights = Weights(trained.critics, state.prior)
             q = networks.values(ensemble, network, weights, batch.observation, drop, 1 if dropout else 0)
-            opinions, mask = q, batch.mask.T
+            member_values, mask = q, batch.mask.T
             if dropout:
-                opinions = networks.values(ensemble, network, weights, batch.observation, drop_read)
+                member_values = networks.values(ensemble, network, weights, batch.observation, drop_read)
                 mask = jnp.ones((1, mask.shape[1]), mask.dtype)
-            opinions = lax.stop_gradient(opinions)
-            _, sigma = networks.mean_and_deviation(opinions)
-            reward, share = judge(networks.batched_index(sigma, batch.action))
+            member_values = lax.stop_gradient(member_values)
+            _, sigma = networks.mean_and_deviation(member_values)
+            reward, share = reward_fn(networks.batched_index(sigma, batch.action))
             target = reward + jnp.where(batch.terminated, 0.0, self.gamma * value)
             taken = networks.batched_index(q, batch.action)
             error = (taken - lax.stop_gradient(target)) / scale
@@ -157,7 +161,7 @@ class SoftActorCritic:
                 critics += self.diversity * gradient_similarity(simplex_gradient(q / scale))
 
             log_here = log_policy(network, trained.actor, batch.observation)
-            scores = prefer_here(lowest(opinions), sigma, batch.observation)
+            scores = score_fn_here(lowest(member_values), sigma, batch.observation)
             actor = -soft_value(lax.stop_gradient(scores) / scale, log_here, temperature).mean()
             heat = temperature_loss(trained.log_temperature, lax.stop_gradient(entropy(log_here)), aim)
             return critics + actor + heat, jnp.max(jnp.abs(taken))
@@ -167,7 +171,7 @@ class SoftActorCritic:
         critics, actor, log_temperature = moved
         trained = Trained(critics, actor, jnp.clip(log_temperature, *LOG_TEMPERATURES))
         target = polyak(state.target, critics, self.tau)
-        return State(trained, state.prior, target, optimiser, state.updates + 1), Watched(lost, largest)
+        return State(trained, state.prior, target, optimiser, state.updates + 1), UpdateInfo(lost, largest)
 
 
 class Trained(NamedTuple):

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,22 +27,12 @@ from uard.agents import networks
 from uard.agents.actor_critic import LOG_TEMPERATURES, Trained, gradient_similarity, polyak, temperature_loss
 from uard.agents.heads import HALF_LOG_TAU, Normal
 from uard.agents.networks import Ensemble, Layer, Network, Weights
-from uard.agents.off_policy import Judge, Watched
+from uard.agents.off_policy import RewardFn, Transitions, UpdateInfo
 from uard.agents.value import backup_weight
 
 LOG_DEVIATIONS = (-5.0, 2.0)
 CQL_ACTIONS = 4  # drawn from the policy, and as many uniformly
 UCB_ACTIONS = 8
-
-
-class Batch(NamedTuple):
-    """Transitions: observation (B, F), action (B, D), following (B, F), terminated (B,), mask (B, N)."""
-
-    observation: Array
-    action: Array
-    following: Array
-    terminated: Array
-    mask: Array
 
 
 @dataclass(frozen=True)
@@ -67,6 +57,8 @@ class ContinuousActorCritic:
         warmup: Steps of uniformly random actions before the first update.
         bootstrap: Chance that a critic learns from a transition.
     """
+
+    family: ClassVar[str] = "continuous-replay"
 
     network: Network = field(default=Network(256, 3e-4, 1.0))
     ensemble: Ensemble = field(default=Ensemble("full", 2, 0.0))
@@ -126,9 +118,11 @@ class ContinuousActorCritic:
     def act(self, state: State, observations: Array, key: Array) -> Array:
         """Draw actions (B, D) within (-1, 1); with ``ucb``, the best of several by mean + ucb deviations."""
         if not self.ucb:
-            return draw(say(self.network, state.trained.actor, observations), key)[0]
+            return draw(action_distribution(self.network, state.trained.actor, observations), key)[0]
         keys = jax.random.split(key, UCB_ACTIONS)
-        offered = jax.vmap(lambda k: draw(say(self.network, state.trained.actor, observations), k)[0])(keys)
+        offered = jax.vmap(lambda k: draw(action_distribution(self.network, state.trained.actor, observations), k)[0])(
+            keys
+        )
         mu, sigma = networks.mean_and_deviation(
             jax.vmap(lambda a: self.values(state, observations, a), out_axes=1)(offered)
         )
@@ -137,29 +131,36 @@ class ContinuousActorCritic:
 
     def greedy(self, state: State, observations: Array) -> Array:
         """Return the policy's middle actions (B, D)."""
-        return jnp.tanh(say(self.network, state.trained.actor, observations).mean)
+        return jnp.tanh(action_distribution(self.network, state.trained.actor, observations).mean)
 
     def update(
-        self, state: State, batch: Batch, judge: Judge, prefer: Callable[[Array, Array], Array], key: Array
-    ) -> tuple[State, Watched]:
+        self,
+        state: State,
+        batch: Transitions,
+        reward_fn: RewardFn,
+        score_fn: Callable[[Array, Array], Array],
+        key: Array,
+    ) -> tuple[State, UpdateInfo]:
         """Take one step of Adam on critics, actor and temperature together.
 
         Args:
             state: Before.
             batch: Transitions.
-            judge: Of sigma_m at the batch's state-actions (B,), the reward to learn from and its weight, (B,) each.
-            prefer: Of mean values and deviations (B,), the mitigation's scores (B,): what the actor climbs.
+            reward_fn: Of sigma_m at the batch's state-actions (B,), the reward to learn from and its weight, (B,) each.
+            score_fn: Of mean values and deviations (B,), the mitigation's scores (B,): what the actor climbs.
             key: For the drawn actions.
         """
         next_key, here_key, pair_key, cql_key = jax.random.split(key, 4)
         scale = self.network.value_scale
         temperature = jnp.exp(state.trained.log_temperature)
-        action_next, log_next = draw(say(self.network, state.trained.actor, batch.following), next_key)
-        following = self._values(Weights(state.target, state.prior), batch.following, action_next)
-        trust = backup_weight(following, self.backup_temperature) if self.backup_temperature else 1.0
+        action_next, log_next = draw(
+            action_distribution(self.network, state.trained.actor, batch.next_observation), next_key
+        )
+        next_values = self._values(Weights(state.target, state.prior), batch.next_observation, action_next)
+        trust = backup_weight(next_values, self.backup_temperature) if self.backup_temperature else 1.0
         if self.pair:
-            following = following[jax.random.permutation(pair_key, self.members)[:2]]
-        value = following.min(0) - temperature * log_next
+            next_values = next_values[jax.random.permutation(pair_key, self.members)[:2]]
+        value = next_values.min(0) - temperature * log_next
         frozen = state.trained.critics
 
         def loss(trained: Trained) -> tuple[Array, Array]:
@@ -176,7 +177,7 @@ class ContinuousActorCritic:
             else:
                 q, slope = q_of(batch.action), None
             _, sigma = networks.mean_and_deviation(lax.stop_gradient(q))
-            reward, share = judge(sigma)
+            reward, share = reward_fn(sigma)
             target = lax.stop_gradient(reward + jnp.where(batch.terminated, 0.0, self.gamma * value))
             error = (q - target) / scale
             # Each critic learns from a mean over the batch; their sum, so that none learns slower than alone.
@@ -188,10 +189,10 @@ class ContinuousActorCritic:
                     self.conservative * self._gap(weights, trained.actor, batch, q, cql_key).mean(1).sum() / scale
                 )
 
-            action, log_here = draw(say(self.network, trained.actor, batch.observation), here_key)
-            opinions = self._values(Weights(lax.stop_gradient(frozen), state.prior), batch.observation, action)
-            mu, doubt = networks.mean_and_deviation(opinions)
-            climbed = prefer(mu if self.pair else opinions.min(0), doubt)
+            action, log_here = draw(action_distribution(self.network, trained.actor, batch.observation), here_key)
+            member_values = self._values(Weights(lax.stop_gradient(frozen), state.prior), batch.observation, action)
+            mu, doubt = networks.mean_and_deviation(member_values)
+            climbed = score_fn(mu if self.pair else member_values.min(0), doubt)
             actor = (lax.stop_gradient(temperature) * log_here - climbed).mean() / scale
             aim = self.entropy * batch.action.shape[1]
             heat = temperature_loss(trained.log_temperature, -lax.stop_gradient(log_here), aim)
@@ -201,15 +202,15 @@ class ContinuousActorCritic:
         moved, optimiser = networks.descend(self.network.learning_rate, gradient, state.optimiser, state.trained)
         moved = moved._replace(log_temperature=jnp.clip(moved.log_temperature, *LOG_TEMPERATURES))
         target = polyak(state.target, moved.critics, self.tau)
-        return State(moved, state.prior, target, optimiser), Watched(lost, largest)
+        return State(moved, state.prior, target, optimiser), UpdateInfo(lost, largest)
 
-    def _gap(self, weights: Weights, actor: Any, batch: Batch, q: Array, key: Array) -> Array:
+    def _gap(self, weights: Weights, actor: Any, batch: Transitions, q: Array, key: Array) -> Array:
         """CQL(H) with importance weights [Kumar et al. 2020, eq. 4 and appendix F]; (N, B)."""
         uniform_key, policy_key = jax.random.split(key)
         rows, motors = batch.action.shape
         uniform = jax.random.uniform(uniform_key, (CQL_ACTIONS, rows, motors), minval=-1.0, maxval=1.0)
-        said = lax.stop_gradient(say(self.network, actor, batch.observation))
-        drawn, logs = jax.vmap(lambda k: draw(said, k))(jax.random.split(policy_key, CQL_ACTIONS))
+        distribution = lax.stop_gradient(action_distribution(self.network, actor, batch.observation))
+        drawn, logs = jax.vmap(lambda k: draw(distribution, k))(jax.random.split(policy_key, CQL_ACTIONS))
         offered = jnp.concatenate([uniform, lax.stop_gradient(drawn)])
         density = jnp.concatenate([jnp.full((CQL_ACTIONS, rows), -motors * math.log(2.0)), lax.stop_gradient(logs)])
         values = jax.vmap(lambda a: self._values(weights, batch.observation, a))(offered)
@@ -226,17 +227,17 @@ class State(NamedTuple):
     optimiser: Any
 
 
-def say(network: Network, layers: tuple[Layer, ...], observations: Array) -> Normal:
+def action_distribution(network: Network, layers: tuple[Layer, ...], observations: Array) -> Normal:
     """Return the normal, before squashing, of (B, F) observations."""
     mean, log_deviation = jnp.split(networks.through(layers, observations, network.activation), 2, -1)
     return Normal(mean, jnp.clip(log_deviation, *LOG_DEVIATIONS))
 
 
-def draw(said: Normal, key: Array) -> tuple[Array, Array]:
+def draw(distribution: Normal, key: Array) -> tuple[Array, Array]:
     """Draw squashed actions (B, D) within (-1, 1), and their log-densities (B,) [Haarnoja et al. 2018, appendix C]."""
-    noise = jax.random.normal(key, said.mean.shape, said.mean.dtype)
-    x = said.mean + jnp.exp(said.log_deviation) * noise
-    log_normal = -(0.5 * noise**2 + said.log_deviation + HALF_LOG_TAU).sum(-1)
+    noise = jax.random.normal(key, distribution.mean.shape, distribution.mean.dtype)
+    x = distribution.mean + jnp.exp(distribution.log_deviation) * noise
+    log_normal = -(0.5 * noise**2 + distribution.log_deviation + HALF_LOG_TAU).sum(-1)
     # log(1 - tanh(x)^2), without the cancellation
     squash = (2.0 * (math.log(2.0) - x - jax.nn.softplus(-2.0 * x))).sum(-1)
     return jnp.tanh(x), log_normal - squash

@@ -1,7 +1,7 @@
-"""What a policy's network says, as a distribution over actions: discrete (categorical) or continuous (normal).
+"""A policy's distribution over actions: discrete (categorical) or continuous (normal).
 
-A policy over A discrete actions is its layers, and what it says are logits (B, A). One over D continuous actions is a
-``GaussianPolicy``, and what it says is a ``Normal``. Everything that policy gradients need of either is here, so that
+A policy over A discrete actions is its layers, and its distribution are logits (B, A). One over D continuous actions is a
+``GaussianPolicy``, and its distribution is a ``Normal``. Everything that policy gradients need of either is here, so that
 PPO, TRPO and CPO do not know which of them they move.
 """
 
@@ -34,7 +34,7 @@ class Normal(NamedTuple):
     log_deviation: Array
 
 
-Said = Array | Normal
+ActionDistribution = Array | Normal
 
 
 def init(key: Array, network: Network, features: int, actions: int, continuous: bool) -> Any:
@@ -43,43 +43,43 @@ def init(key: Array, network: Network, features: int, actions: int, continuous: 
     return GaussianPolicy(layers, jnp.zeros(actions, jnp.float32)) if continuous else layers
 
 
-def say(network: Network, policy: Any, observations: Array) -> Said:
-    """Return what a policy says of (B, features) observations."""
+def action_distribution(network: Network, policy: Any, observations: Array) -> ActionDistribution:
+    """Return a policy's distribution over actions at (B, features) observations."""
     if isinstance(policy, GaussianPolicy):
         return Normal(networks.through(policy.layers, observations, network.activation), policy.log_deviation)
     return networks.through(policy, observations, network.activation)
 
 
-def draw(said: Said, key: Array) -> Array:
+def draw(distribution: ActionDistribution, key: Array) -> Array:
     """Draw actions: (B,) integers, or (B, D) without bounds."""
-    if isinstance(said, Normal):
-        noise = jax.random.normal(key, said.mean.shape, said.mean.dtype)
-        return said.mean + jnp.exp(said.log_deviation) * noise
-    return jax.random.categorical(key, said).astype(jnp.int32)
+    if isinstance(distribution, Normal):
+        noise = jax.random.normal(key, distribution.mean.shape, distribution.mean.dtype)
+        return distribution.mean + jnp.exp(distribution.log_deviation) * noise
+    return jax.random.categorical(key, distribution).astype(jnp.int32)
 
 
-def likeliest(said: Said) -> Array:
+def likeliest(distribution: ActionDistribution) -> Array:
     """Return the likeliest actions: (B,) integers, or (B, D)."""
-    return said.mean if isinstance(said, Normal) else jnp.argmax(said, -1).astype(jnp.int32)
+    return distribution.mean if isinstance(distribution, Normal) else jnp.argmax(distribution, -1).astype(jnp.int32)
 
 
-def log_probability(said: Said, action: Array) -> Array:
+def log_probability(distribution: ActionDistribution, action: Array) -> Array:
     """Return the log-probability (discrete) or log-density (continuous) of actions, (B,)."""
-    if isinstance(said, Normal):
-        z = (action - said.mean) * jnp.exp(-said.log_deviation)
-        return -(0.5 * z * z + said.log_deviation + HALF_LOG_TAU).sum(-1)
-    return networks.batched_index(jax.nn.log_softmax(said), action)
+    if isinstance(distribution, Normal):
+        z = (action - distribution.mean) * jnp.exp(-distribution.log_deviation)
+        return -(0.5 * z * z + distribution.log_deviation + HALF_LOG_TAU).sum(-1)
+    return networks.batched_index(jax.nn.log_softmax(distribution), action)
 
 
-def entropy(said: Said) -> Array:
+def entropy(distribution: ActionDistribution) -> Array:
     """Return the entropy in nats: (B,), or () where it does not depend on the state."""
-    if isinstance(said, Normal):
-        return (said.log_deviation + 0.5 + HALF_LOG_TAU).sum(-1)
-    logs = jax.nn.log_softmax(said)
+    if isinstance(distribution, Normal):
+        return (distribution.log_deviation + 0.5 + HALF_LOG_TAU).sum(-1)
+    logs = jax.nn.log_softmax(distribution)
     return -(jnp.exp(logs) * logs).sum(-1)
 
 
-def divergence(old: Said, new: Said) -> Array:
+def divergence(old: ActionDistribution, new: ActionDistribution) -> Array:
     """Return the mean KL(old || new), in nats."""
     if isinstance(old, Normal):
         assert isinstance(new, Normal)
@@ -91,18 +91,18 @@ def divergence(old: Said, new: Said) -> Array:
     return (jnp.exp(before) * (before - after)).sum(-1).mean()
 
 
-def curvature(said: Said, direction: Said) -> Said:
-    """Return M u / B: the second derivative of the mean KL at what is said, times a direction in the same space.
+def curvature(distribution: ActionDistribution, direction: ActionDistribution) -> ActionDistribution:
+    """Return M u / B: the second derivative of the mean KL at a distribution, times a direction in the same space.
 
     For logits M is diag(p) - p p' of each row; for normals it is 1 / deviation^2 of the means, and 2 of the log
     deviations.
     """
-    if isinstance(said, Normal):
+    if isinstance(distribution, Normal):
         assert isinstance(direction, Normal)
-        rows = said.mean.shape[0]
-        of_mean = jnp.exp(-2.0 * said.log_deviation) * direction.mean / rows
-        shared = said.log_deviation.ndim == 1  # then the mean over rows is over equal terms
+        rows = distribution.mean.shape[0]
+        of_mean = jnp.exp(-2.0 * distribution.log_deviation) * direction.mean / rows
+        shared = distribution.log_deviation.ndim == 1  # then the mean over rows is over equal terms
         return Normal(of_mean, 2.0 * direction.log_deviation / (1 if shared else rows))
     assert not isinstance(direction, Normal)
-    p = jax.nn.softmax(said)
+    p = jax.nn.softmax(distribution)
     return p * (direction - (p * direction).sum(-1, keepdims=True)) / p.shape[0]

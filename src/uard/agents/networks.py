@@ -52,12 +52,12 @@ class Network:
 
 @dataclass(frozen=True)
 class Ensemble:
-    """How several opinions are had of one value (K4, K9).
+    """How several estimates are had of one value (K4, K9).
 
     Attributes:
         kind: ``full``: independent networks; ``shared``: heads on one trunk; ``dropout``: one network, its hidden units
             dropped at random, several passes.
-        members: Number of opinions N; 1 is a single network.
+        members: Number of estimates N; 1 is a single network.
         prior_scale: Size of the fixed random function that is added to each member, in units of ``value_scale``, so
             that members disagree where there was no data [Osband et al. 2018]. Not for ``dropout``.
         dropout: Share of hidden units that a ``dropout`` pass leaves out, in [0, 0.9].

@@ -12,35 +12,35 @@ from uard.agents.networks import Network
 Backup = Literal["greedy", "consistent"]  # which value the target takes: the best, or that of the best score
 
 
-class Batch(NamedTuple):
+class Transitions(NamedTuple):
     """Transitions drawn from the buffer.
 
     Attributes:
         observation: (B, features), or (B,) whole numbers that stand for one-hot rows.
         action: (B,).
-        following: Alike, the observation after the step.
+        next_observation: Alike, the observation after the step.
         terminated: (B,), whether the step ended the episode; a cut-off at the horizon does not count.
         mask: (B, N), which members learn from a transition (0 or 1).
     """
 
     observation: Array
     action: Array
-    following: Array
+    next_observation: Array
     terminated: Array
     mask: Array
 
 
-class Watched(NamedTuple):
-    """What is watched for divergence after an update: the loss, and the largest absolute value it saw."""
+class UpdateInfo(NamedTuple):
+    """What is looked at for divergence after an update: the loss, and the largest absolute value it saw."""
 
     loss: Array
     largest: Array
 
 
 # Of the ensemble's disagreement about the batch's state-actions (B,), the reward to learn from and its weight (B,).
-Judge = Callable[[Array], tuple[Any, Any]]
+RewardFn = Callable[[Array], tuple[Any, Any]]
 # Of mean values (B, A), their deviations (B, A) and the observations (B, features), the mitigation's scores (B, A).
-Prefer = Callable[[Array, Array, Array], Array]
+ScoreFn = Callable[[Array, Array, Array], Array]
 
 
 @runtime_checkable
@@ -74,23 +74,23 @@ class OffPolicy(Protocol):
         """Return all members' values, (N, B, A), of observations (B, features)."""
         ...
 
-    def act(self, state: Any, observation: Array, prefer: Prefer, episode: Array, key: Array) -> Array:
+    def act(self, state: Any, observation: Array, score_fn: ScoreFn, episode: Array, key: Array) -> Array:
         """Return an exploring action for one observation (features,) in the given episode (0-based)."""
         ...
 
-    def greedy(self, state: Any, observation: Array, prefer: Prefer, key: Array) -> Array:
+    def greedy(self, state: Any, observation: Array, score_fn: ScoreFn, key: Array) -> Array:
         """Return the action without exploration."""
         ...
 
     def update(
         self,
         state: Any,
-        batch: Batch,
-        judge: Judge,
-        prefer: Prefer,
-        prefer_here: Prefer,
+        batch: Transitions,
+        reward_fn: RewardFn,
+        score_fn: ScoreFn,
+        score_fn_here: ScoreFn,
         backup: Backup,
         key: Array,
-    ) -> tuple[Any, Watched]:
-        """Learn from one batch; ``prefer`` scores the observations after its steps, ``prefer_here`` those before."""
+    ) -> tuple[Any, UpdateInfo]:
+        """Learn from one batch; ``score_fn`` scores the observations after its steps, ``score_fn_here`` those before."""
         ...

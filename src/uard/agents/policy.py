@@ -5,14 +5,14 @@
 * CPO [Achiam et al. 2017]: TRPO with a budget of cost per episode.
 
 Policy and critic are separate networks of one size. These agents have no action values and no maximum in their targets,
-so a mitigation's ``backup`` means nothing to them; how its scores do is said at ``Experience``.
+so a mitigation's ``backup`` means nothing to them; how its scores do stands at ``Experience``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +22,9 @@ from jax.flatten_util import ravel_pytree
 
 from uard import _checks
 from uard.agents import heads, networks
-from uard.agents.heads import Said, divergence, entropy, log_probability
+from uard.agents.heads import ActionDistribution, divergence, entropy, log_probability
 from uard.agents.networks import SINGLE, Ensemble, Layer, Network, Weights
-from uard.agents.off_policy import Watched
+from uard.agents.off_policy import UpdateInfo
 
 Layers = tuple[Layer, ...]
 
@@ -35,31 +35,31 @@ class Experience(NamedTuple):
     Attributes:
         observation: (T, E, features), or (T, E) whole numbers that stand for one-hot rows.
         action: (T, E).
-        following: Alike, the observation after the step, before any reset.
+        next_observation: Alike, the observation after the step, before any reset.
         reward: (T, E), the reward to learn from.
         weight: (T, E), how much a step counts in the losses; 0 skips it.
         cost: (T, E), what CPO has to keep within its budget.
         terminated: (T, E), whether the step ended the episode; a cut-off at the horizon does not count.
         done: (T, E), whether it ended or was cut off.
         values: (N, T, E), the members' values of ``observation``.
-        following_values: (N, T, E), those of ``following``.
+        next_values: (N, T, E), those of ``next_observation``.
         horizon: Steps after which an episode is cut off.
-        prefer: Of the estimated values Q = V + A of the actions taken (T, E), the mitigation's scores (T, E). The
-            advantage climbed is prefer(Q) - V: GAE's own for a mitigation that does not score.
+        score_fn: Of the estimated values Q = V + A of the actions taken (T, E), the mitigation's scores (T, E). The
+            advantage climbed is score_fn(Q) - V: GAE's own for a mitigation that does not score.
     """
 
     observation: Array
     action: Array
-    following: Array
+    next_observation: Array
     reward: Array
     weight: Array
     cost: Array
     terminated: Array
     done: Array
     values: Array
-    following_values: Array
+    next_values: Array
     horizon: Array
-    prefer: Callable[[Array], Array]
+    score_fn: Callable[[Array], Array]
 
 
 class Batch(NamedTuple):
@@ -105,7 +105,7 @@ class PolicyGradient:
 
     Attributes:
         network: Size of the policy and of the critic, Adam's step size, unit of values.
-        ensemble: The critic: how many opinions of V, and of which kind. sigma_m of a step is how much they differ on
+        ensemble: The critic: how many estimates of V, and of which kind. sigma_m of a step is how much they differ on
             the state it leads to, discounted.
         gamma: Discount in [0, 1).
         gae_lambda: Lambda of the generalised advantage estimate, in [0, 1].
@@ -118,6 +118,8 @@ class PolicyGradient:
             reward units, >= 0 [Strehl and Littman 2008]. With it all of ten PPO runs arrive on the 10x10 grid; without
             it, five of ten on the true reward and two of ten with ``uard``.
     """
+
+    family: ClassVar[str] = "rollout"
 
     network: Network = field(default_factory=Network)
     ensemble: Ensemble = field(default_factory=Ensemble)
@@ -160,17 +162,17 @@ class PolicyGradient:
 
     def act(self, state: State, observations: Array, key: Array) -> Array:
         """Draw an action for each of (B, features) observations; continuous ones have no bounds."""
-        return heads.draw(heads.say(self.network, state.policy, observations), key)
+        return heads.draw(heads.action_distribution(self.network, state.policy, observations), key)
 
     def greedy(self, state: State, observation: Array) -> Array:
         """Return the likeliest action for one observation (features,)."""
-        return heads.likeliest(heads.say(self.network, state.policy, observation[None]))[0]
+        return heads.likeliest(heads.action_distribution(self.network, state.policy, observation[None]))[0]
 
     def values(self, state: State, observations: Array, key: Array) -> Array:
         """Return all members' values (N, B) of observations (B, features)."""
         return networks.values(self.ensemble, self.network, state.value, observations, key)[..., 0]
 
-    def update(self, state: State, experience: Experience, key: Array) -> tuple[State, Watched]:
+    def update(self, state: State, experience: Experience, key: Array) -> tuple[State, UpdateInfo]:
         """Learn from one rollout."""
         raise NotImplementedError
 
@@ -185,12 +187,12 @@ class PolicyGradient:
             return optax.apply_updates(layers, step), optimiser
 
     def _batch(self, e: Experience) -> Batch:
-        def of_member(values: Array, following: Array) -> Array:
-            return gae(e.reward, values, following, e.terminated, e.done, self.gamma, self.gae_lambda)
+        def of_member(values: Array, next_values: Array) -> Array:
+            return gae(e.reward, values, next_values, e.terminated, e.done, self.gamma, self.gae_lambda)
 
         # GAE is linear in the values: the mean of the members' estimates is the estimate from their mean.
-        target = e.values + jax.vmap(of_member)(e.values, e.following_values)
-        advantage = e.prefer(target.mean(0)) - e.values.mean(0)
+        target = e.values + jax.vmap(of_member)(e.values, e.next_values)
+        advantage = e.score_fn(target.mean(0)) - e.values.mean(0)
         return Batch(
             _flat(e.observation),
             _flat(e.action),
@@ -221,19 +223,19 @@ class PolicyGradient:
 
     def _fitted(
         self, ensemble: Ensemble, weights: Weights, optimiser: Any, batch: Batch, key: Array
-    ) -> tuple[Weights, Any, Watched]:
+    ) -> tuple[Weights, Any, UpdateInfo]:
         """Fit a critic to the targets."""
 
         def one(c: tuple[Layers, Any], x: tuple[Array, Array]) -> tuple[tuple[Layers, Any], tuple[Array, Array]]:
             part = _take(batch, x[0])
             (layers, optimiser) = c
-            gradient, watched = jax.grad(
+            gradient, info = jax.grad(
                 lambda layers: self._critic_loss(ensemble, Weights(layers, weights.prior), part, x[1]), has_aux=True
             )(layers)
-            return self._descend(gradient, optimiser, layers), watched
+            return self._descend(gradient, optimiser, layers), info
 
         (layers, optimiser), (losses, largest) = lax.scan(one, (weights.layers, optimiser), self._shuffled(batch, key))
-        return Weights(layers, weights.prior), optimiser, Watched(losses.sum(), largest.max())
+        return Weights(layers, weights.prior), optimiser, UpdateInfo(losses.sum(), largest.max())
 
 
 @dataclass(frozen=True)
@@ -255,28 +257,28 @@ class PPO(PolicyGradient):
         _checks.number("clip", self.clip, low=0, high=0.99, open_low=True)
         _checks.number("entropy", self.entropy, low=0)
 
-    def update(self, state: State, experience: Experience, key: Array) -> tuple[State, Watched]:
+    def update(self, state: State, experience: Experience, key: Array) -> tuple[State, UpdateInfo]:
         """Take ``epochs`` times ``minibatches`` steps of Adam on policy and critic."""
         batch = self._batch(experience)
-        old = log_probability(heads.say(self.network, state.policy, batch.observation), batch.action)
+        old = log_probability(heads.action_distribution(self.network, state.policy, batch.observation), batch.action)
 
         def one(s: State, x: tuple[Array, Array]) -> tuple[State, tuple[Array, Array]]:
             part, before = _take(batch, x[0]), old[x[0]]
 
             def loss(policy: Layers, layers: Layers) -> tuple[Array, tuple[Array, Array]]:
-                said = heads.say(self.network, policy, part.observation)
-                gain = clipped_surrogate(log_probability(said, part.action) - before, part.advantage, self.clip)
-                gain = (part.weight * (gain + self.entropy * entropy(said))).mean()
-                fit, watched = self._critic_loss(self.ensemble, Weights(layers, s.value.prior), part, x[1])
-                return fit - gain, (fit - gain, watched[1])
+                distribution = heads.action_distribution(self.network, policy, part.observation)
+                gain = clipped_surrogate(log_probability(distribution, part.action) - before, part.advantage, self.clip)
+                gain = (part.weight * (gain + self.entropy * entropy(distribution))).mean()
+                fit, info = self._critic_loss(self.ensemble, Weights(layers, s.value.prior), part, x[1])
+                return fit - gain, (fit - gain, info[1])
 
-            (to_policy, to_value), watched = jax.grad(loss, (0, 1), has_aux=True)(s.policy, s.value.layers)
+            (to_policy, to_value), info = jax.grad(loss, (0, 1), has_aux=True)(s.policy, s.value.layers)
             policy, policy_optimiser = self._descend(to_policy, s.policy_optimiser, s.policy)
             layers, value_optimiser = self._descend(to_value, s.value_optimiser, s.value.layers)
-            return State(policy, Weights(layers, s.value.prior), policy_optimiser, value_optimiser, ()), watched
+            return State(policy, Weights(layers, s.value.prior), policy_optimiser, value_optimiser, ()), info
 
         state, (losses, largest) = lax.scan(one, state, self._shuffled(batch, key))
-        return state, Watched(losses.sum(), largest.max())
+        return state, UpdateInfo(losses.sum(), largest.max())
 
 
 @dataclass(frozen=True)
@@ -306,30 +308,30 @@ class TRPO(PolicyGradient):
         _checks.whole("backtracks", self.backtracks, low=1, high=1000)
         _checks.number("shrink", self.shrink, low=0, high=0.99, open_low=True)
 
-    def update(self, state: State, experience: Experience, key: Array) -> tuple[State, Watched]:
+    def update(self, state: State, experience: Experience, key: Array) -> tuple[State, UpdateInfo]:
         """Take one step of the policy, then fit the critic."""
         batch = self._batch(experience)
         policy = self.improved(state.policy, batch)
-        value, optimiser, watched = self._fitted(self.ensemble, state.value, state.value_optimiser, batch, key)
-        return State(policy, value, state.policy_optimiser, optimiser, ()), watched
+        value, optimiser, info = self._fitted(self.ensemble, state.value, state.value_optimiser, batch, key)
+        return State(policy, value, state.policy_optimiser, optimiser, ()), info
 
     def improved(self, policy: Layers, batch: Batch) -> Layers:
         """Return the policy after one step of at most ``delta``; the same if no step of the line search improves it."""
         theta, shape = ravel_pytree(policy)
-        said_of = _said_of(self.network, shape, batch)
-        old = said_of(theta)
+        distribution_of = _distribution_of(self.network, shape, batch)
+        old = distribution_of(theta)
 
         def gain(theta: Array) -> Array:
-            return surrogate(said_of(theta), old, batch.action, batch.weight * batch.advantage)
+            return surrogate(distribution_of(theta), old, batch.action, batch.weight * batch.advantage)
 
         gradient = jax.grad(gain)(theta)
-        product = fisher_product(said_of, theta, self.damping)
+        product = fisher_product(distribution_of, theta, self.damping)
         direction = conjugate_gradient(product, gradient, self.conjugate_steps)
         step = jnp.sqrt(2.0 * self.delta / jnp.maximum(direction @ product(direction), TINY)) * direction
         before = gain(theta)
 
         def accept(new: Array) -> Array:
-            return (divergence(old, said_of(new)) <= self.delta) & (gain(new) > before)
+            return (divergence(old, distribution_of(new)) <= self.delta) & (gain(new) > before)
 
         return shape(line_search(theta, step, accept, self.backtracks, self.shrink))
 
@@ -373,7 +375,7 @@ class CPO(TRPO):
         costs = Costs(weights, self._adam().init(weights.layers), jnp.float32(0.0), jnp.float32(0.0))
         return super().init(own, features, actions, continuous)._replace(costs=costs)
 
-    def update(self, state: State, experience: Experience, key: Array) -> tuple[State, Watched]:
+    def update(self, state: State, experience: Experience, key: Array) -> tuple[State, UpdateInfo]:
         """Take one step of the policy, then fit both critics."""
         e, costs = experience, state.costs
         value_key, cost_key = jax.random.split(key)
@@ -382,8 +384,8 @@ class CPO(TRPO):
         def critic(observations: Array) -> Array:
             return networks.values(SINGLE, self.network, costs.weights, observations)[0, ..., 0]
 
-        values, following = jax.vmap(critic)(e.observation), jax.vmap(critic)(e.following)
-        advantage = gae(e.cost, values, following, e.terminated, e.done, self.gamma, self.gae_lambda)
+        values, next_values = jax.vmap(critic)(e.observation), jax.vmap(critic)(e.next_observation)
+        advantage = gae(e.cost, values, next_values, e.terminated, e.done, self.gamma, self.gae_lambda)
         costly = batch._replace(
             advantage=_flat(advantage - advantage.mean()),
             target=_flat(values + advantage)[None],
@@ -396,10 +398,10 @@ class CPO(TRPO):
         excess = e.cost.mean() - self.limit * rate
 
         policy = self.constrained(state.policy, batch, costly.advantage, excess)
-        value, optimiser, watched = self._fitted(self.ensemble, state.value, state.value_optimiser, batch, value_key)
+        value, optimiser, info = self._fitted(self.ensemble, state.value, state.value_optimiser, batch, value_key)
         weights, moments, of_costs = self._fitted(SINGLE, costs.weights, costs.optimiser, costly, cost_key)
         after = State(policy, value, state.policy_optimiser, optimiser, Costs(weights, moments, ends, trust))
-        return after, Watched(watched.loss + of_costs.loss, jnp.maximum(watched.largest, of_costs.largest))
+        return after, UpdateInfo(info.loss + of_costs.loss, jnp.maximum(info.largest, of_costs.largest))
 
     def constrained(self, policy: Layers, batch: Batch, cost_advantage: Array, excess: Array) -> Layers:
         """Return the policy after one step within the trust region and, to first order, within the budget.
@@ -411,17 +413,17 @@ class CPO(TRPO):
             excess: By how much the old policy's cost per step is above the budget.
         """
         theta, shape = ravel_pytree(policy)
-        said_of = _said_of(self.network, shape, batch)
-        old = said_of(theta)
+        distribution_of = _distribution_of(self.network, shape, batch)
+        old = distribution_of(theta)
 
         def gain(theta: Array) -> Array:
-            return surrogate(said_of(theta), old, batch.action, batch.weight * batch.advantage)
+            return surrogate(distribution_of(theta), old, batch.action, batch.weight * batch.advantage)
 
         def price(theta: Array) -> Array:
-            return surrogate(said_of(theta), old, batch.action, cost_advantage)
+            return surrogate(distribution_of(theta), old, batch.action, cost_advantage)
 
         g, b = jax.grad(gain)(theta), jax.grad(price)(theta)
-        product = fisher_product(said_of, theta, self.damping)
+        product = fisher_product(distribution_of, theta, self.damping)
         solve = jax.vmap(lambda v: conjugate_gradient(product, v, self.conjugate_steps))
         to_gain, to_price = solve(jnp.stack([g, b]))
         q, r, s = g @ to_gain, g @ to_price, b @ to_price
@@ -430,7 +432,7 @@ class CPO(TRPO):
         gain_before, price_before = gain(theta), price(theta)
 
         def accept(new: Array) -> Array:
-            near = divergence(old, said_of(new)) <= self.delta
+            near = divergence(old, distribution_of(new)) <= self.delta
             cheap = price(new) - price_before <= jnp.maximum(-excess, 0.0)
             # Who is beyond the budget has to come back first, whatever the gain.
             better = (gain(new) > gain_before) | (excess > 0) | ~feasible
@@ -446,7 +448,7 @@ TINY = 1e-20
 def gae(
     reward: Array,
     values: Array,
-    following: Array,
+    next_values: Array,
     terminated: Array,
     done: Array,
     gamma: Array | float,
@@ -457,13 +459,13 @@ def gae(
     Args:
         reward: (T, ...).
         values: (T, ...), V of the states.
-        following: (T, ...), V of the states that the steps led to, also where an episode was cut off.
+        next_values: (T, ...), V of the states that the steps led to, also where an episode was cut off.
         terminated: (T, ...), where nothing follows.
         done: (T, ...), where the next row belongs to another episode.
         gamma: Discount.
         lam: Lambda.
     """
-    delta = reward + jnp.where(terminated, 0.0, gamma * following) - values
+    delta = reward + jnp.where(terminated, 0.0, gamma * next_values) - values
 
     def back(later: Array, x: tuple[Array, Array]) -> tuple[Array, Array]:
         error, over = x
@@ -486,22 +488,24 @@ def clipped_surrogate(log_ratio: Array, advantage: Array, clip: Array | float) -
     return jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage)
 
 
-def surrogate(new: Said, old: Said, action: Array, advantage: Array) -> Array:
-    """Return the mean of ratio times advantage (B,), for what the policies say of the actions."""
+def surrogate(new: ActionDistribution, old: ActionDistribution, action: Array, advantage: Array) -> Array:
+    """Return the mean of ratio times advantage (B,), for what two policies' distributions give the actions."""
     ratio = jnp.exp(log_probability(new, action) - lax.stop_gradient(log_probability(old, action)))
     return (ratio * advantage).mean()
 
 
-def fisher_product(said_of: Callable[[Array], Any], theta: Array, damping: Array | float) -> Callable[[Array], Array]:
+def fisher_product(
+    distribution_of: Callable[[Array], Any], theta: Array, damping: Array | float
+) -> Callable[[Array], Array]:
     """Return v -> (F + damping) v, F the Fisher matrix of the mean KL at ``theta``.
 
-    ``said_of`` maps parameters (P,) to what the policy says. F is J' M J / B, see ``heads.curvature``.
+    ``distribution_of`` maps parameters (P,) to the policy's distribution. F is J' M J / B, see ``heads.curvature``.
     """
-    said, push = jax.linearize(said_of, theta)
+    distribution, push = jax.linearize(distribution_of, theta)
     pull = jax.linear_transpose(push, theta)
 
     def product(v: Array) -> Array:
-        return pull(heads.curvature(said, push(v)))[0] + damping * v
+        return pull(heads.curvature(distribution, push(v)))[0] + damping * v
 
     return product
 
@@ -571,8 +575,8 @@ def line_search(
     return jnp.where(found, theta + factor * step, theta)
 
 
-def _said_of(network: Network, shape: Callable[[Array], Any], batch: Batch) -> Callable[[Array], Any]:
-    return lambda theta: heads.say(network, shape(theta), batch.observation)
+def _distribution_of(network: Network, shape: Callable[[Array], Any], batch: Batch) -> Callable[[Array], Any]:
+    return lambda theta: heads.action_distribution(network, shape(theta), batch.observation)
 
 
 def _flat(x: Array) -> Array:

@@ -7,7 +7,7 @@ its protocol and never sees the true reward.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,8 @@ class QLearning:
         init_scale: Initial values are uniform in +-init_scale.
         abstention: When to defer (A42, A43), if ever.
     """
+
+    family: ClassVar[str] = "tabular"
 
     heads: int = 5
     learning_rate: float = 0.1

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from jax import Array
 from uard import _checks
 from uard.agents import networks
 from uard.agents.networks import SINGLE, Ensemble, Network, Weights
-from uard.agents.off_policy import Backup, Batch, Judge, Prefer, Watched
+from uard.agents.off_policy import Backup, RewardFn, ScoreFn, Transitions, UpdateInfo
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class DeepQ:
 
     Attributes:
         network: Size and step size, the same for all deep agents.
-        ensemble: How many opinions, and of which kind.
+        ensemble: How many member_values, and of which kind.
         gamma: Discount in [0, 1).
         epsilon: Exploration rate of the first episode; every episode multiplies it by ``epsilon_decay``, down to
             ``epsilon_min``.
@@ -46,6 +46,8 @@ class DeepQ:
         ucb: SUNRISE's exploration bonus >= 0, in deviations.
         temperature: SUNRISE's temperature of backup weights >= 0; 0 weighs all alike.
     """
+
+    family: ClassVar[str] = "replay"
 
     network: Network = field(default_factory=Network)
     ensemble: Ensemble = SINGLE
@@ -96,39 +98,41 @@ class DeepQ:
         """Return mu and sigma_m, (B, A) each."""
         return networks.mean_and_deviation(self.values(state, observations, key))
 
-    def act(self, state: State, observation: Array, prefer: Prefer, episode: Array, key: Array) -> Array:
+    def act(self, state: State, observation: Array, score_fn: ScoreFn, episode: Array, key: Array) -> Array:
         """Return an epsilon-greedy action on the mitigation's scores (plus SUNRISE's bonus)."""
         explore, choice, dropout = jax.random.split(key, 3)
         mu, sigma = self.read(state, observation[None], dropout)
-        scores = prefer(mu, sigma, observation[None]) + self.ucb * sigma
+        scores = score_fn(mu, sigma, observation[None]) + self.ucb * sigma
         rate = jnp.maximum(self.epsilon * self.epsilon_decay ** episode.astype(jnp.float32), self.epsilon_min)
         chance = jax.random.randint(choice, (), 0, mu.shape[-1])
         return jnp.where(jax.random.uniform(explore) < rate, chance, jnp.argmax(scores[0])).astype(jnp.int32)
 
-    def greedy(self, state: State, observation: Array, prefer: Prefer, key: Array) -> Array:
+    def greedy(self, state: State, observation: Array, score_fn: ScoreFn, key: Array) -> Array:
         """Return the action with the best score."""
         mu, sigma = self.read(state, observation[None], key)
-        return jnp.argmax(prefer(mu, sigma, observation[None])[0]).astype(jnp.int32)
+        return jnp.argmax(score_fn(mu, sigma, observation[None])[0]).astype(jnp.int32)
 
     def update(
         self,
         state: State,
-        batch: Batch,
-        judge: Judge,
-        prefer: Prefer,
-        prefer_here: Prefer,
+        batch: Transitions,
+        reward_fn: RewardFn,
+        score_fn: ScoreFn,
+        score_fn_here: ScoreFn,
         backup: Backup,
         key: Array,
-    ) -> tuple[State, Watched]:
+    ) -> tuple[State, UpdateInfo]:
         """Take one step of Adam on the temporal difference (and CQL's gap)."""
         drop, drop_next, drop_read = jax.random.split(key, 3)
         frozen = Weights(state.target, state.weights.prior)
-        following = networks.values(self.ensemble, self.network, frozen, batch.following, drop_next)
+        next_values = networks.values(self.ensemble, self.network, frozen, batch.next_observation, drop_next)
         if backup == "consistent":
-            mu, sigma = networks.mean_and_deviation(following)
-            value = networks.batched_index(following, jnp.argmax(prefer(mu, sigma, batch.following), axis=-1))
+            mu, sigma = networks.mean_and_deviation(next_values)
+            value = networks.batched_index(
+                next_values, jnp.argmax(score_fn(mu, sigma, batch.next_observation), axis=-1)
+            )
         else:
-            value = following.max(-1)
+            value = next_values.max(-1)
         weight = jnp.where(batch.terminated, 1.0, backup_weight(value, self.temperature))
 
         def loss(layers: Any) -> tuple[Array, Array]:
@@ -137,13 +141,13 @@ class DeepQ:
             q = networks.values(self.ensemble, self.network, weights, batch.observation, drop, passes)
             taken = networks.batched_index(q, batch.action)
             if self.ensemble.kind == "dropout" and self.members > 1:
-                opinions = networks.values(self.ensemble, self.network, weights, batch.observation, drop_read)
-                opinions = networks.batched_index(opinions, batch.action)
+                member_values = networks.values(self.ensemble, self.network, weights, batch.observation, drop_read)
+                member_values = networks.batched_index(member_values, batch.action)
                 targets, mask = value.mean(0, keepdims=True), jnp.ones_like(taken)
             else:
-                opinions, targets, mask = taken, value, batch.mask.T
-            _, sigma = networks.mean_and_deviation(jax.lax.stop_gradient(opinions))
-            reward, share = judge(sigma)
+                member_values, targets, mask = taken, value, batch.mask.T
+            _, sigma = networks.mean_and_deviation(jax.lax.stop_gradient(member_values))
+            reward, share = reward_fn(sigma)
             target = reward + jnp.where(batch.terminated, 0.0, self.gamma * targets)
             error = (taken - jax.lax.stop_gradient(target)) / self.network.value_scale
             gap = conservative_gap(q, batch.action) / self.network.value_scale**2
@@ -156,7 +160,7 @@ class DeepQ:
         count = state.updates + 1
         fresh = count % self.target_every == 0
         target = jax.tree.map(lambda new, old: jnp.where(fresh, new, old), layers, state.target)
-        return State(Weights(layers, state.weights.prior), target, optimiser, count), Watched(lost, largest)
+        return State(Weights(layers, state.weights.prior), target, optimiser, count), UpdateInfo(lost, largest)
 
 
 class State(NamedTuple):
@@ -178,7 +182,7 @@ def conservative_gap(values: Array, action: Array) -> Array:
     return jax.nn.logsumexp(values, axis=-1) - networks.batched_index(values, action)
 
 
-def backup_weight(following: Array, temperature: Array | float) -> Array:
+def backup_weight(next_values: Array, temperature: Array | float) -> Array:
     """SUNRISE's weight of a backup, sigmoid(-T sigma') + 0.5 in (0.5, 1]; (B,), from targets (N, B)."""
-    _, sigma = networks.mean_and_deviation(following)
+    _, sigma = networks.mean_and_deviation(next_values)
     return jax.nn.sigmoid(-temperature * sigma) + 0.5

@@ -68,7 +68,7 @@ class Doctor:
 
     def _log(self) -> RatingLog:
         """Return the log: of a file if it looks like one, else of an environment."""
-        from uard.ratings import readers
+        from uard.ratings import readers, rollout
 
         if Path(self.log).suffix.lower() in readers.FORMATS or Path(self.log).exists():
             return readers.read(self.log, self.reward, self.ratings or None)
@@ -86,6 +86,6 @@ class Doctor:
         except TypeError as error:  # an unknown keyword
             raise InvalidValueError("set", dict(keywords), f"keywords of {self.log} ({error})") from None
         try:
-            return readers.rollout(env, self.steps, self.seed)
+            return rollout.rollout(env, self.steps, self.seed)
         finally:
             env.close()

@@ -95,12 +95,13 @@ class Run:
             }
             terminal.write_json(answer, self.json)
         if self.json != "-":
-            self._print(cell, metrics)
+            self._print(metrics)
 
     def _cell(self) -> tuple[Cell, float]:
         """Return what is trained, and the reward of its environment's traps (0 if it has none)."""
         from uard.lab import registry
         from uard.lab.cell import Cell
+        from uard.ratings.panels import as_panel
 
         environment = registry.environment(self.environment, settings.settings(self.set))
         trap_reward = getattr(environment, "trap_reward", 0.0)
@@ -110,11 +111,11 @@ class Run:
             environment,
             settings.mitigation(self.mitigation, changes),
             agent,
-            self.panel,
+            as_panel(self.panel),
             self._noise(trap_reward),
             self.rated,
             self.episodes,
-            feedback=registry.feedback(self.feedback, agent, environment),
+            rating_model=registry.rating_model(self.feedback, agent, environment),
             steps=self.steps,
             query=self.query,
         )
@@ -131,8 +132,8 @@ class Run:
             raise _checks.InvalidValueError("noise", self.noise, "left out when --noise-fraction is given")
         return self.noise_fraction * abs(trap_reward)
 
-    def _print(self, cell: Cell, metrics: dict[str, Any]) -> None:
-        title = f"{self.environment} / {self.agent} / {self.mitigation} / {cell.panel}, {self.seeds} seeds"
+    def _print(self, metrics: dict[str, Any]) -> None:
+        title = f"{self.environment} / {self.agent} / {self.mitigation} / {self.panel}, {self.seeds} seeds"
         rows = [
             (
                 name.replace("_", " "),

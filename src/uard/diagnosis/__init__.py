@@ -1,1 +1,7 @@
-"""The doctor: which known traps a log of rewards and ratings is in."""
+"""The doctor: which known traps a log of rewards and ratings is in, and what avoids them."""
+
+from uard.diagnosis.case import PRINTED
+from uard.diagnosis.doctor import CODES, doctor, filtered
+from uard.diagnosis.finding import SEVERITIES, Diagnosis, Finding
+
+__all__ = ["CODES", "PRINTED", "SEVERITIES", "Diagnosis", "Finding", "doctor", "filtered"]

@@ -1,43 +1,119 @@
-"""What a configuration of an environment is: a frozen dataclass that can build its world, or its tables."""
+"""What the configuration of an environment is: a frozen dataclass of one of three kinds.
+
+The kind says what an agent can be trained with (``uard.training.trainers``): tables, a compiled world, or a simulator that
+runs on the host.
+"""
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from uard.envs.tables import HiddenTruth, Ratings, Task
+import numpy as np
 
+from uard import _checks
+from uard.envs.simulator import Simulator
+from uard.envs.tables import HiddenTruth, Task
+from uard.ratings.panels import Panel, RatingLaw
 
-@runtime_checkable
-class Spec(Protocol):
-    """An environment's configuration."""
+if TYPE_CHECKING:
+    from uard.envs.world import TableWorld
 
-    @property
-    def horizon(self) -> int | None:
-        """Steps per episode."""
-        ...
-
-    def world(self, panel: str = "main", noise: float = 0.0) -> Any:
-        """Build the compiled environment (``uard.envs.world.World``) with its panel of annotators."""
-        ...
+Kind = Literal["tables", "world", "simulator"]
 
 
-@runtime_checkable
-class Tables(Spec, Protocol):
+class Environment(ABC):
+    """An environment's configuration; subclasses are frozen dataclasses.
+
+    Attributes:
+        kind: How it is run.
+        horizon: Steps per episode.
+    """
+
+    kind: ClassVar[Kind]
+    horizon: int | None
+
+
+class CompiledEnvironment(Environment):
+    """One whose world is compiled together with the training loop; its actions are discrete."""
+
+    kind: ClassVar[Kind] = "world"
+
+    @abstractmethod
+    def world(self, panel: Panel, noise: float = 0.0) -> Any:
+        """Build the compiled environment (``uard.envs.world.World``), each step rated by a panel (needs JAX).
+
+        Args:
+            panel: Who rates.
+            noise: Standard deviation of extra normal noise of every rater, in reward units, >= 0.
+        """
+
+
+class TableEnvironment(CompiledEnvironment):
     """One that is small enough for tables; tabular agents need it."""
 
+    kind: ClassVar[Kind] = "tables"
+
     @property
+    @abstractmethod
     def states(self) -> int:
         """Number of states."""
-        ...
 
+    @abstractmethod
     def task(self) -> Task:
         """Return what an agent meets."""
-        ...
 
+    @abstractmethod
     def truth(self) -> HiddenTruth:
         """Return what only the evaluation may see."""
-        ...
 
-    def speech(self, panel: str, noise: float) -> Ratings:
-        """Return what the panel says of every step."""
-        ...
+    def rating_law(self, panel: Panel, noise: float = 0.0) -> RatingLaw:
+        """Return what a panel says of every step, (S, A, K) float32; arguments as for ``world``."""
+        return law_of_tables(panel, self.task(), self.truth(), noise)
+
+    def world(self, panel: Panel, noise: float = 0.0) -> TableWorld:
+        """Build the compiled environment of the tables."""
+        from uard.envs.world import table_world
+
+        return table_world(self.task(), self.truth(), self.rating_law(panel, noise))
+
+
+class SimulatedEnvironment(Environment):
+    """One that runs on the host, in several copies; its actions are continuous, within [-1, 1]."""
+
+    kind: ClassVar[Kind] = "simulator"
+    horizon: int
+
+    @property
+    @abstractmethod
+    def features(self) -> int:
+        """Length of an observation."""
+
+    @property
+    @abstractmethod
+    def actions(self) -> int:
+        """Length of an action."""
+
+    @abstractmethod
+    def simulator(self, copies: int, seed: int, threads: int = 1) -> Simulator:
+        """Build and reset all copies.
+
+        Args:
+            copies: E >= 1.
+            seed: Of everything random.
+            threads: Threads that share the copies; results do not depend on it.
+        """
+
+
+def law_of_tables(panel: Panel, task: Task, truth: HiddenTruth, noise: float = 0.0) -> RatingLaw:
+    """Return what a panel says of every step of tables.
+
+    Args:
+        panel: Who rates.
+        task: Gives the observed reward.
+        truth: Gives the true reward and the contested steps.
+        noise: Standard deviation of extra normal noise of every rater, in reward units, >= 0.
+    """
+    _checks.number("noise", noise, low=0)
+    law = panel.law(np.asarray(task.reward, float), np.asarray(truth.reward, float), np.asarray(truth.hack), noise)
+    return law._replace(centre=law.centre.astype(np.float32), deviation=law.deviation.astype(np.float32))

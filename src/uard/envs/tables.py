@@ -1,7 +1,7 @@
 """A small decision problem as tables, and its one-step dynamics.
 
 ``Task`` is what an agent meets. ``HiddenTruth`` is for evaluation only and travels apart from it: no agent,
-feedback model or mitigation takes it as an argument.
+model of ratings or mitigation takes it as an argument.
 """
 
 from __future__ import annotations
@@ -43,17 +43,6 @@ class HiddenTruth(NamedTuple):
     goal: Array
 
 
-class Ratings(NamedTuple):
-    """What annotators say of a step: rating k is normal with (S, A, K) ``centre`` and ``deviation``.
-
-    ``reach`` is (S, A): 1 where they can rate, 0 where nobody ever does; None if they reach every step.
-    """
-
-    centre: Array
-    deviation: Array
-    reach: Array | None = None
-
-
 def at(table: Array, index: Array) -> Array:
     """Return ``table[index]`` for an index that is known to be in range (in JAX)."""
     from jax import lax
@@ -73,7 +62,7 @@ def pad(tables: Any, states: int) -> Any:
     """Append unreachable states so that tables of several sizes fit one compiled program."""
 
     def grow(table: Any) -> Any:
-        if table is None or np.ndim(table) < 2:
+        if table is None or isinstance(table, tuple) or np.ndim(table) < 2:
             return table
         table = np.asarray(table)
         extra = np.zeros((states - table.shape[0], *table.shape[1:]), table.dtype)

@@ -2,8 +2,8 @@
 
 A world is a pytree (its numbers are data, so that one program serves many worlds) with the methods of ``World``, each
 for one state; loops map them over batches. What an agent may see of a step is what ``observe``, ``step`` and the
-panel's ratings give. ``judge`` is for evaluation only: loops write it into their log and hand it to no agent, feedback
-model or mitigation.
+panel's ratings give. ``evaluate`` is for evaluation only: loops write it into their log and hand it to no agent, model
+of ratings or mitigation.
 
 A world's class is registered by ``register_pytree_node_class``, or is told from others by a static field: JAX 0.10
 takes two classes registered by ``register_dataclass`` for one structure if their fields are alike, and ``jit`` may mix
@@ -20,7 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from uard.envs.tables import MIN_STATES, HiddenTruth, Ratings, Task, pad
+from uard.envs.tables import MIN_STATES, HiddenTruth, Task, pad
+from uard.ratings.panels import RatingLaw
 
 
 class Step(NamedTuple):
@@ -36,7 +37,7 @@ class Step(NamedTuple):
     doubt: Array
 
 
-class Verdict(NamedTuple):
+class Evaluation(NamedTuple):
     """What a step was really worth, whether it was a hack, whether it reached the goal: for evaluation only."""
 
     reward: Array
@@ -97,12 +98,12 @@ class World(Protocol):
         """Return a number of the state-action: equal ones have equal numbers; different ones rarely share one."""
         ...
 
-    def judge(self, state: Any, action: Array, after: Step) -> Verdict:
-        """Say what a step was really worth; for evaluation only."""
+    def evaluate(self, state: Any, action: Array, after: Step) -> Evaluation:
+        """Return what a step was really worth; for evaluation only."""
         ...
 
-    def rate(self, state: Any, action: Array, after: Step) -> Ratings:
-        """Return what the panel says of a step: (K,) centre and deviation."""
+    def rating_law(self, state: Any, action: Array, after: Step) -> RatingLaw:
+        """Return how the panel answers about a step: (K,) centre and deviation."""
         ...
 
 
@@ -114,16 +115,16 @@ class TableWorld:
     Attributes:
         task: What an agent meets; ``start`` may hold several states, of which each episode draws one.
         truth: What the evaluation sees.
-        said: What the panel says of every step.
+        law: How the panel answers about every step.
     """
 
     task: Task
     truth: HiddenTruth
-    said: Ratings
+    law: RatingLaw
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
         """Give JAX the tables."""
-        return (self.task, self.truth, self.said), None
+        return (self.task, self.truth, self.law), None
 
     @classmethod
     def tree_unflatten(cls, aux: None, children: Any) -> TableWorld:
@@ -143,7 +144,7 @@ class TableWorld:
     @property
     def raters(self) -> int:
         """Number of annotators."""
-        return self.said.centre.shape[-1]
+        return self.law.centre.shape[-1]
 
     @property
     def slots(self) -> int:
@@ -175,18 +176,18 @@ class TableWorld:
         """Return the number of the state-action; none share one."""
         return state * self.actions + action
 
-    def judge(self, state: Array, action: Array, after: Step) -> Verdict:
+    def evaluate(self, state: Array, action: Array, after: Step) -> Evaluation:
         """Look the truth up."""
-        return Verdict(*(table[state, action] for table in self.truth))
+        return Evaluation(*(table[state, action] for table in self.truth))
 
-    def rate(self, state: Array, action: Array, after: Step) -> Ratings:
-        """Look the panel's speech up."""
-        return Ratings(*(None if table is None else table[state, action] for table in self.said))
+    def rating_law(self, state: Array, action: Array, after: Step) -> RatingLaw:
+        """Look the panel's answers up."""
+        return self.law.at(state, action)
 
 
-def table_world(task: Task, truth: HiddenTruth, said: Ratings, states: int = MIN_STATES) -> TableWorld:
+def table_world(task: Task, truth: HiddenTruth, law: RatingLaw, states: int = MIN_STATES) -> TableWorld:
     """Build a world of tables, padded so that small ones share one compiled program."""
     states = max(states, task.next_state.shape[0])
     starts = np.atleast_1d(np.asarray(task.start, np.int32))
     task = task._replace(start=np.resize(starts, max(len(starts), 2)))  # one start twice: the same program as for two
-    return TableWorld(pad(task, states), pad(truth, states), pad(said, states))
+    return TableWorld(pad(task, states), pad(truth, states), pad(law, states))

@@ -52,7 +52,7 @@ class Scale:
         deviation = math.sqrt(self.square / self.count) if self.count else 0.0
         return deviation if deviation > EQUAL * abs(self.location) else 0.0
 
-    def hear(self, values: np.ndarray) -> None:
+    def observe(self, values: np.ndarray) -> None:
         """Take in some numbers [Chan et al. 1979], unless the scale is fixed."""
         if self.fixed is not None or values.size == 0:
             return

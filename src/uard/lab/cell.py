@@ -13,12 +13,11 @@ import numpy as np
 
 from uard import _checks
 from uard.agents.tabular import QLearning
-from uard.envs.base import Spec
+from uard.envs.base import CompiledEnvironment, SimulatedEnvironment
 from uard.envs.grids.trapgrid import TrapGrid
-from uard.envs.locomotion.physics import Locomotion
 from uard.lab import registry as names
 from uard.method.mitigations import Mitigation, Raw
-from uard.ratings.panels import PANELS
+from uard.ratings.panels import MAIN, Panel
 from uard.training.feedback.rating_model import RatingModel
 from uard.training.feedback.transition_model import QUERIES, TransitionModel
 
@@ -42,7 +41,7 @@ class Cell:
         episodes: Training episodes, >= 1; ignored for a ``Locomotion``.
         ddof: Of the annotators' deviation.
         snapshots: Tables kept along the way, for the uncertainty curves; tabular agents only.
-        feedback: How a deep agent knows of ratings: a model of them, or running means per state-action if None (which a
+        rating_model: How a deep agent knows of ratings: a model of them, or running means per state-action if None (which a
             tabular agent always has). For a ``Locomotion`` always a model of transitions.
         steps: Environment steps, for a ``Locomotion`` only; 1 000 000 if None.
         query: Which steps are rated: ``random``, or half of them where the model of ratings knows least (``doubtful``;
@@ -52,13 +51,13 @@ class Cell:
     environment: Any = field(default_factory=TrapGrid)
     mitigation: Mitigation = field(default_factory=Raw)
     agent: Any = field(default_factory=QLearning)
-    panel: str = "main"
+    panel: Panel = MAIN
     noise: float = 0.0
     rated: float = 1.0
     episodes: int = 500
     ddof: int = 0
     snapshots: int = 0
-    feedback: RatingModel | TransitionModel | None = field(default=None, metadata=LATER)
+    rating_model: RatingModel | TransitionModel | None = field(default=None, metadata=LATER)
     steps: int | None = field(default=None, metadata=LATER)
     query: str = field(default="random", metadata=LATER)
 
@@ -69,44 +68,49 @@ class Cell:
             InvalidValueError: a field out of range, or an agent that cannot work in the environment, with those that
                 can.
         """
-        _checks.choose("panel", self.panel, PANELS)
+        if not isinstance(self.panel, Panel):
+            raise _checks.InvalidValueError("panel", self.panel, "a Panel (see uard.ratings.panels.PANELS)")
         _checks.number("noise", self.noise, low=0)
         _checks.number("rated", self.rated, low=0, high=1)
         _checks.whole("episodes", self.episodes, low=1, high=1_000_000)
         _checks.whole("ddof", self.ddof, low=0, high=1)
         _checks.whole("snapshots", self.snapshots, low=0, high=1000)
         _checks.choose("query", self.query, QUERIES)
-        for name, kind in (("environment", Spec | Locomotion), ("mitigation", Mitigation), ("agent", names.Agent)):
+        for name, kind in (
+            ("environment", CompiledEnvironment | SimulatedEnvironment),
+            ("mitigation", Mitigation),
+            ("agent", names.Agent),
+        ):
             value = getattr(self, name)
             if not isinstance(value, kind) or not _checks.is_frozen(value):
                 raise _checks.InvalidValueError(name, value, f"a frozen dataclass that is {_an(kind)}")
             object.__setattr__(self, name, _settled(name, value))
         names.check_pair(self.agent, self.environment)
-        physical = isinstance(self.environment, Locomotion)
+        physical = isinstance(self.environment, SimulatedEnvironment)
         if physical:
             _checks.whole("steps", STEPS if self.steps is None else self.steps, low=1, high=10**12)
             object.__setattr__(self, "steps", int(STEPS if self.steps is None else self.steps))
             object.__setattr__(self, "episodes", 500)
-            if self.feedback is None:
-                object.__setattr__(self, "feedback", TransitionModel())
+            if self.rating_model is None:
+                object.__setattr__(self, "rating_model", TransitionModel())
         elif self.steps is not None:
             raise _checks.InvalidValueError("steps", self.steps, "left out but for Hopper and Walker2d; see episodes")
         elif self.query != "random":
             raise _checks.InvalidValueError("query", self.query, "random but for Hopper and Walker2d")
         if isinstance(self.agent, QLearning):
-            if self.feedback is not None:
+            if self.rating_model is not None:
                 raise _checks.InvalidValueError(
-                    "feedback", self.feedback, "none for a tabular agent, which keeps tables"
+                    "rating_model", self.rating_model, "none for a tabular agent, which keeps tables"
                 )
         elif self.snapshots:
             raise _checks.InvalidValueError("snapshots", self.snapshots, "0 for an agent that keeps no tables")
-        if self.feedback is not None:
+        if self.rating_model is not None:
             wanted = TransitionModel if physical else RatingModel
-            if not isinstance(self.feedback, wanted):
-                raise _checks.InvalidValueError("feedback", self.feedback, f"a {wanted.__name__} or none")
-            object.__setattr__(self, "feedback", _settled("feedback", self.feedback))
+            if not isinstance(self.rating_model, wanted):
+                raise _checks.InvalidValueError("rating_model", self.rating_model, f"a {wanted.__name__} or none")
+            object.__setattr__(self, "rating_model", _settled("rating_model", self.rating_model))
         if not self.mitigation.reads_feedback:
-            unheard = {"panel": "main", "noise": 0.0, "rated": 1.0, "feedback": None, "query": "random"}
+            unheard = {"panel": MAIN, "noise": 0.0, "rated": 1.0, "rating_model": None, "query": "random"}
             for name, value in unheard.items():
                 object.__setattr__(self, name, value)
         for name, kind in (("noise", float), ("rated", float), ("episodes", int), ("ddof", int), ("snapshots", int)):

@@ -16,7 +16,7 @@ from uard.agents.off_policy import OffPolicy
 from uard.agents.policy import CPO, PPO, TRPO, PolicyGradient
 from uard.agents.tabular import QLearning
 from uard.agents.value import DeepQ
-from uard.envs.base import Spec, Tables
+from uard.envs.base import CompiledEnvironment, SimulatedEnvironment, TableEnvironment
 from uard.envs.classic.specs import Acrobot, CartPole
 from uard.envs.grids.gaming import AbsentSupervisor, BoatRace, TomatoWatering
 from uard.envs.grids.trapgrid import TrapGrid
@@ -109,7 +109,7 @@ def can_work(agent: Any, environment: Any) -> bool:
         return isinstance(agent, PolicyGradient | ContinuousActorCritic)
     if isinstance(agent, ContinuousActorCritic):
         return False
-    return isinstance(environment, Tables) or not isinstance(agent, QLearning)
+    return isinstance(environment, TableEnvironment) or not isinstance(agent, QLearning)
 
 
 def check_pair(agent: Any, environment: Any) -> None:
@@ -142,7 +142,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "mitigation": (*mitigation.NAMED,),
 }
 IS_ONE: dict[str, Callable[[Any], bool]] = {
-    "environment": lambda value: isinstance(value, Spec | Locomotion),
+    "environment": lambda value: isinstance(value, CompiledEnvironment | SimulatedEnvironment),
     "agent": lambda value: isinstance(value, Agent),
     "mitigation": mitigation.is_mitigation,
 }
@@ -188,7 +188,7 @@ def agent(name: str, changes: dict[str, Any], environment: Any = None) -> Agent:
     return changed(base, changes, "agent")
 
 
-def feedback(name: str | None, of: Agent, environment: Any = None) -> RatingModel | None:
+def rating_model(name: str | None, of: Agent, environment: Any = None) -> RatingModel | None:
     """Return how an agent knows of ratings: ``model`` (a deep agent's default) or ``table`` (a tabular one's)."""
     if isinstance(environment, Locomotion):
         if name not in (None, "model"):

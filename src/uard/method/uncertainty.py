@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 import warnings
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,7 +34,7 @@ def sigma_model(values: Array, axis: int = -1, ddof: int = 1) -> Array:
     values = _floats("values", values)
     _enough("members", values.shape[axis] if values.ndim else 0, ddof)
     _checks.finite("values", values)
-    return _std(values, axis, ddof)
+    return deviation(values, axis, ddof)
 
 
 def sigma_human(
@@ -81,7 +81,7 @@ def sigma_human(
             if empty is None:
                 _enough("annotators", raters, ddof)
             return namespace(ratings).sum(ratings * 0.0, axis=axis) + empty
-        return _std(ratings, axis, ddof)
+        return deviation(ratings, axis, ddof)
     xp = namespace(ratings, mask)
     ratings, here = xp.asarray(ratings), xp.asarray(mask)
     _checks.same_shape("mask", here, "ratings", ratings)
@@ -100,14 +100,15 @@ def _floats(field: str, values: Array, mask: Array | None = None) -> Array:
     return values if xp.isdtype(values.dtype, "real floating") else xp.astype(values, xp.asarray(0.0).dtype)
 
 
-def _std(values: Array, axis: int, ddof: int) -> Array:
+def deviation(values: Array, axis: int, ddof: int) -> Array:
+    """Standard deviation along an axis, nothing checked; its gradient where all agree is 0, see ``root``."""
     xp = namespace(values)
     centre = xp.mean(values, axis=axis, keepdims=True)
     square = (values - centre) * (values - centre)
-    return _root(xp.sum(square, axis=axis) / (values.shape[axis] - ddof))
+    return root(xp.sum(square, axis=axis) / (values.shape[axis] - ddof))
 
 
-def _root(variance: Array) -> Array:
+def root(variance: Array) -> Array:
     """Return the square root; its gradient where all agree is 0, not infinite: an actor may climb a score of it."""
     xp = namespace(variance)
     apart = xp.where(variance == 0, xp.ones_like(variance), xp.zeros_like(variance))
@@ -129,7 +130,7 @@ def _masked_std(ratings: Array, mask: Array, axis: int, ddof: int, empty: float 
     centre = xp.sum(values, axis=axis, keepdims=True) / xp.where(count > 0, count, one)
     square = xp.where(mask, (values - centre) * (values - centre), xp.zeros_like(values))
     variance = xp.sum(square, axis=axis, keepdims=True) / xp.where(few, one, count - ddof)
-    sigma = xp.where(few, one * (math.nan if empty is None else empty), _root(variance))
+    sigma = xp.where(few, one * (math.nan if empty is None else empty), root(variance))
     return xp.squeeze(sigma, axis=axis)
 
 
@@ -174,14 +175,14 @@ def shrink(sigma: Array, count: Array, prior: Array, strength: Array = 1.0) -> A
     return xp.where(total > 0, (heard + strength * prior) / safe, prior + 0.0 * total)
 
 
-class Spread(NamedTuple):
-    """What is usual for a quantity over distinct state-actions."""
+class Location(NamedTuple):
+    """Mean and mean absolute deviation of a quantity over distinct state-actions."""
 
     location: Array
-    deviation: Array
+    mad: Array
 
 
-def spread(values: Array, mask: Array) -> Spread:
+def location_and_mad(values: Array, mask: Array) -> Location:
     """Mean and mean absolute deviation of the masked-in values; both 0 if there are none.
 
     Taken over *distinct* state-actions: an agent that sits in a trap must not dilute its own alarm.
@@ -191,33 +192,5 @@ def spread(values: Array, mask: Array) -> Spread:
     count = xp.sum(xp.where(mask, xp.ones_like(values), zero))
     count = xp.where(count > 0, count, xp.ones_like(count))
     location = xp.sum(xp.where(mask, values, zero)) / count
-    deviation = xp.sum(xp.where(mask, xp.abs(values - location), zero)) / count
-    return Spread(location, deviation)
-
-
-def ratings_from(rows: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Turn rows of numbers with ``None`` for a missing rating into (ratings, mask).
-
-    Raises:
-        InvalidValueError: rows of unequal length, or an entry that is neither a finite number nor ``None``;
-            the message names row and column.
-    """
-    try:
-        table = [list(row) for row in rows]
-    except TypeError:
-        raise _checks.InvalidValueError("ratings", rows, "a list of rows, one rating per annotator in each") from None
-    width = len(table[0]) if table else 0
-    ratings, mask = np.zeros((len(table), width)), np.zeros((len(table), width), dtype=bool)
-    for i, row in enumerate(table):
-        if len(row) != width:
-            raise _checks.InvalidValueError(f"ratings[{i}]", row, f"a row of {width} ratings, like the first")
-        for j, entry in enumerate(row):
-            if entry is None:
-                continue
-            try:
-                _checks.number("", entry)
-            except _checks.InvalidValueError:
-                allowed = "a finite number, or None where a rating is missing"
-                raise _checks.InvalidValueError(f"ratings[{i}, {j}]", entry, allowed) from None
-            ratings[i, j], mask[i, j] = entry, True
-    return ratings, mask
+    mad = xp.sum(xp.where(mask, xp.abs(values - location), zero)) / count
+    return Location(location, mad)

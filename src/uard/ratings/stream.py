@@ -1,8 +1,8 @@
 """The filter for somebody else's training: rewards and ratings go in step by step, rewards to learn from come out.
 
-A ``RewardStream`` is all that the adapters share. It remembers what was said of which state-action (``keys``), or,
-where no state-action comes twice, takes each step's own ratings as what is known of it and a uniform sample of all
-rated steps as what is usual.
+A ``RewardStream`` is all that the adapters share. Where state-actions come again (``keys``) it remembers what was said
+of each; where none comes twice, a step's own ratings are all that is known of it, and a uniform sample of all rated steps
+stands for the others.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ import numpy as np
 
 from uard import _checks
 from uard.method.abstention import Abstention
-from uard.method.mitigations import Evidence, Feedback, Mitigation, RewardDiscounting, uard
-from uard.method.weights import discount
+from uard.method.feedback import Feedback
+from uard.method.mitigations import Evidence, Mitigation, uard
+from uard.ratings.aggregate import aggregate, nothing
+from uard.ratings.memory import FeedbackTable, RatingSample
 
-SURE = 1e6  # visits that a step's own ratings are worth where nothing else can tell of it
 PATIENCE = 1000  # steps without any rating before we say so
 
 
@@ -50,13 +51,26 @@ class Filtered(NamedTuple):
     rated: np.ndarray
 
 
+class Observed(NamedTuple):
+    """What ``RewardStream.observe`` has taken in of (B,) steps.
+
+    Attributes:
+        visit: What was said of the steps themselves.
+        slots: Where each step's state-action is kept, (B,); None without keys.
+    """
+
+    visit: Feedback
+    slots: np.ndarray | None
+
+
 class RewardStream:
     """Filters rewards as they come. Changed in place; pickling keeps all that it knows.
 
     Attributes:
         mitigation: What is done with a reward.
         abstention: A rule by which steps are marked as such that an agent should not act on; none marks none.
-        seen: Steps rated so far.
+        ddof: Of sigma_h.
+        rated: Steps rated so far.
     """
 
     def __init__(
@@ -76,7 +90,7 @@ class RewardStream:
             abstention: See the attribute.
             ddof: Of sigma_h.
             capacity: Rated steps kept where steps have no keys, >= 2.
-            refresh: Rated steps after which what is usual is measured anew, >= 1 (more often at the beginning).
+            refresh: Rated steps after which the panel's statistics are measured anew, >= 1 (more often at first).
             seed: Of the sample of steps that are kept.
 
         Raises:
@@ -87,24 +101,24 @@ class RewardStream:
             raise _checks.InvalidValueError(
                 "mitigation", mitigation, "a Mitigation (see uard.method.mitigations.named)"
             )
-        if isinstance(self.mitigation, RewardDiscounting) and self.mitigation.acts_on != "reward":
+        if self.mitigation.acts_on != "reward":
             raise _checks.InvalidValueError(
                 "mitigation.acts_on", self.mitigation.acts_on, "'reward': actions are not chosen here"
             )
         _checks.whole("ddof", ddof, high=1)
         _checks.whole("capacity", capacity, low=2)
         _checks.whole("refresh", refresh, low=1)
+        # What will never be rated again is known as well as it will ever be.
+        self._of_single_visits = self.mitigation.without_prior()
         self.abstention = abstention
-        self.seen = 0
-        self._ddof, self._capacity, self._refresh = ddof, capacity, refresh
-        self._random = np.random.default_rng(seed)
-        self._rows = np.zeros((64, 5))  # count, mean, lowest, spread, proxy
-        self._filled = 0
+        self.rated = 0
+        self.ddof, self._refresh = ddof, refresh
+        self._table = FeedbackTable()
+        self._sample = RatingSample(capacity, seed)
         self._slots: dict[Hashable, int] = {}
-        self._raters = 1.0
-        self._steps = 0
+        self._steps, self._warned = 0, False
         self._due = 0
-        self._usual: Any = ()  # as the mitigation measures it
+        self._statistics: dict[bool, Any] = {}  # by whether state-actions have keys
 
     def __call__(
         self,
@@ -113,7 +127,7 @@ class RewardStream:
         sigma_m: Any = None,
         keys: Sequence[Hashable] | None = None,
     ) -> Filtered:
-        """Hear what was said of some steps, and return their rewards, filtered.
+        """Observe what was said of some steps, and return their rewards, filtered.
 
         Args:
             reward: Observed rewards (B,), finite.
@@ -124,144 +138,85 @@ class RewardStream:
         Raises:
             InvalidValueError: naming field, place, value and what is allowed.
         """
-        slots, own = self.hear(reward, ratings, keys)
-        return self.filter(reward, own if slots is None else self._rows[slots], sigma_m, own[:, 0] > 0)
+        visit, slots = self.observe(reward, ratings, keys)
+        known = visit if slots is None else self.known(slots)
+        return self.filter(reward, known, sigma_m, keyed=slots is not None, rated=visit.count > 0)
 
-    def hear(
-        self, reward: Any, ratings: Any = None, keys: Sequence[Hashable] | None = None
-    ) -> tuple[np.ndarray | None, np.ndarray]:
-        """Remember what was said of some steps; see ``__call__``.
-
-        Returns:
-            Where each key's row is (B,), or None without keys; and what was said of the steps themselves, (B, 5):
-            count (0 where nobody rated), mean, lowest, sigma_h, observed reward.
-        """
+    def observe(self, reward: Any, ratings: Any = None, keys: Sequence[Hashable] | None = None) -> Observed:
+        """Remember what was said of some steps; see ``__call__``."""
         reward = _column("reward", reward)
-        said = self._said(reward, ratings)
-        rated = np.flatnonzero(said[:, 0])
+        ratings = np.full((len(reward), 1), np.nan) if ratings is None else _checks.as_numpy("ratings", ratings)
+        visit = aggregate(ratings, reward, ddof=self.ddof)
+        rated = np.flatnonzero(visit.count)
         self._steps += len(reward)
-        if self.seen == 0 and len(rated) == 0 and self._steps >= PATIENCE and self.mitigation.reads_feedback:
-            self._steps = -(2**62)  # once
+        self.rated += len(rated)
+        if self.rated == 0 and self._steps >= PATIENCE and not self._warned and self.mitigation.reads_feedback:
+            self._warned = True
             warnings.warn(
                 f"{PATIENCE} steps and no rating of any: nothing is known of the reward, and it is believed equally "
                 "little everywhere. Give ratings, or leave the filter out",
                 NeverRatedWarning,
                 stacklevel=3,
             )
-        slots = None
-        if keys is not None:
-            if len(keys) != len(reward):
-                raise _checks.InvalidValueError("len(keys)", len(keys), f"{len(reward)}, one per reward")
-            slots = np.array([self._slot(key) for key in keys], np.int64)
-            for i in rated:
-                row = self._rows[slots[i]]
-                row[0] += 1
-                row[1:] += (said[i, 1:] - row[1:]) / row[0]
-        else:
-            said[:, 0] *= SURE
-            self._keep(said[rated])
-        self.seen += len(rated)
-        return slots, said
+        if keys is None:
+            self._sample.put(ratings[rated], reward[rated])
+            return Observed(visit, None)
+        if len(keys) != len(reward):
+            raise _checks.InvalidValueError("len(keys)", len(keys), f"{len(reward)}, one per reward")
+        slots = np.array([self._slots.setdefault(key, len(self._slots)) for key in keys], np.int64)
+        self._table.observe(slots, visit, len(self._slots))
+        return Observed(visit, slots)
 
-    def filter(self, reward: Any, rows: np.ndarray, sigma_m: Any = None, rated: np.ndarray | None = None) -> Filtered:
-        """Filter rewards by rows as ``hear`` gives them; nothing is remembered.
+    def filter(
+        self,
+        reward: Any,
+        known: Feedback,
+        sigma_m: Any = None,
+        *,
+        keyed: bool,
+        rated: np.ndarray | None = None,
+    ) -> Filtered:
+        """Filter rewards by what is known; nothing is remembered.
 
         Args:
             reward: (B,).
-            rows: (B, 5).
+            known: Of the steps' state-actions, (B,) arrays: the visit itself, or ``known(slots)``.
             sigma_m: (B,) or None.
+            keyed: Whether that comes from a table of state-actions that come again.
             rated: (B,) of bool, which steps were rated themselves; those with a count if left out.
         """
         reward = _column("reward", reward)
         sigma_m = np.zeros(len(reward)) if sigma_m is None else _column("sigma_m", sigma_m, nonnegative=True)
         if len(sigma_m) != len(reward):
             raise _checks.InvalidValueError("len(sigma_m)", len(sigma_m), f"{len(reward)}, one per reward")
-        raters = np.float64(self._raters)
-        feedback = _feedback(rows, raters)
-        if self.seen >= self._due:
-            self._measure(raters)
-        evidence = Evidence(reward, sigma_m, feedback)
-        ones, zeros = np.ones(len(reward)), np.zeros(len(reward))
-        if isinstance(self.mitigation, RewardDiscounting):
-            why = self.mitigation.explain(evidence, self._usual)
-            out, weight, sigma_h, lam = discount(reward, why.weight, why.anchor), why.weight, why.sigma_h, why.lam
-            doubt = self.mitigation.filter.alpha * sigma_m + self.mitigation.filter.beta * sigma_h
-        else:
-            signal = self.mitigation.signal(evidence, self._usual)
-            if np.any(np.asarray(signal.sample_weight) != 1.0):
-                raise _checks.InvalidValueError(
-                    "mitigation", self.mitigation, "one that changes rewards; this one leaves steps out of learning"
-                )
-            out, weight, lam = np.asarray(signal.reward, np.float64), ones, zeros
-            sigma_h = np.where(feedback.count > 0, feedback.spread, 0.0)
-            doubt = sigma_m + sigma_h
-        _checks.finite("filtered reward", out)
-        abstained = zeros.astype(bool) if self.abstention is None else self.abstention.abstains(doubt, reward)
-        rated = rows[:, 0] > 0 if rated is None else rated
-        return Filtered(out, reward, weight + zeros, sigma_h, sigma_m, lam + zeros, abstained, rated)
-
-    def rows(self, slots: np.ndarray) -> np.ndarray:
-        """Return what is known at places that ``hear`` gave, (B, 5)."""
-        return self._rows[slots]
-
-    def _said(self, reward: np.ndarray, ratings: Any) -> np.ndarray:
-        said = np.zeros((len(reward), 5))
-        if ratings is None:
-            return said
-        ratings = _checks.as_numpy("ratings", ratings)
-        if ratings.ndim != 2 or len(ratings) != len(reward) or ratings.shape[1] == 0:
+        mitigation = self.mitigation if keyed else self._of_single_visits
+        why = mitigation.explain(Evidence(reward, sigma_m, known), self._measured(keyed))
+        if np.any(np.asarray(why.signal.sample_weight) != 1.0):
             raise _checks.InvalidValueError(
-                "ratings.shape", ratings.shape, f"({len(reward)}, K): one row per reward and one column per rater"
+                "mitigation", self.mitigation, "one that changes rewards; this one leaves steps out of learning"
             )
-        here = ~np.isnan(ratings)
-        number = np.add.reduce(here, 1)
-        if not number.any():
-            return said
-        self._raters = max(self._raters, float(ratings.shape[1]))
-        held = np.where(here, ratings, 0.0)
-        _checks.finite("ratings", held)
-        at_least = np.maximum(number, 1)
-        mean = np.add.reduce(held, 1) / at_least
-        square = np.where(here, (ratings - mean[:, None]) ** 2, 0.0)
-        said[:, 0] = number > 0
-        said[:, 1] = mean
-        said[:, 2] = np.where(number > 0, np.minimum.reduce(np.where(here, ratings, np.inf), 1), 0.0)
-        said[:, 3] = np.sqrt(np.add.reduce(square, 1) / np.maximum(number - self._ddof, 1))  # uncertainty.sigma_human
-        said[:, 4] = reward
-        return said
+        zeros = np.zeros(len(reward))
+        out = np.asarray(why.signal.reward, np.float64) + zeros
+        _checks.finite("filtered reward", out)
+        abstained = zeros.astype(bool) if self.abstention is None else self.abstention.abstains(why.doubt, reward)
+        rated = known.count > 0 if rated is None else rated
+        return Filtered(out, reward, why.weight + zeros, why.sigma_h, sigma_m, why.lam + zeros, abstained, rated)
 
-    def _slot(self, key: Hashable) -> int:
-        slot = self._slots.get(key)
-        if slot is None:
-            slot = self._slots[key] = self._filled
-            self._grow(self._filled + 1)
-            self._filled += 1
-        return slot
+    def known(self, slots: np.ndarray) -> Feedback:
+        """Return what is known of state-actions at places that ``observe`` gave, (B,) arrays."""
+        return self._table[slots]
 
-    def _grow(self, size: int) -> None:
-        if size > len(self._rows):
-            self._rows = np.concatenate([self._rows, np.zeros((max(size, 2 * len(self._rows)) - len(self._rows), 5))])
-
-    def _keep(self, said: np.ndarray) -> None:
-        """Put rated steps into the sample [Vitter 1985, algorithm R]."""
-        free = min(len(said), self._capacity - self._filled)
-        self._grow(self._filled + free)
-        self._rows[self._filled : self._filled + free] = said[:free]
-        self._filled += free
-        later = np.arange(free, len(said))
-        places = self._random.integers(0, self.seen + later + 1) if len(later) else later
-        for i, place in zip(later, places, strict=True):
-            if place < self._capacity:
-                self._rows[place] = said[i]
-
-    def _measure(self, raters: np.float64) -> None:
-        known = self._rows[: max(self._filled, 1)]
-        self._usual = self.mitigation.usual(_feedback(known, raters), known[:, 0] > 0)
-        self._due = self.seen + max(1, min(self.seen, self._refresh))
-
-
-def _feedback(rows: np.ndarray, raters: np.float64) -> Feedback:
-    return Feedback._make([*np.ascontiguousarray(rows.T), raters])
+    def _measured(self, keyed: bool) -> Any:
+        """Return the panel's statistics, measured anew when enough has been rated since."""
+        if self.rated >= self._due:
+            self._statistics.clear()
+            self._due = self.rated + max(1, min(self.rated, self._refresh))
+        if keyed not in self._statistics:
+            every = self._table.every() if keyed else self._sample.feedback(self.ddof)
+            if not len(every.count):
+                every = nothing((1,), 1)
+            self._statistics[keyed] = self.mitigation.fit(every, every.count > 0)
+        return self._statistics[keyed]
 
 
 def _column(field: str, values: Any, nonnegative: bool = False) -> np.ndarray:

@@ -32,24 +32,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from uard import _checks
-from uard.judges.asking import Judge, JudgeError, Scale, as_scores, ask, by_name
+from uard.judges.asking import Judge, Scale, as_scores, ask, by_name
 from uard.method.mitigations import Mitigation, uard
 from uard.ratings.stream import RewardStream
-
-__all__ = [
-    "DiscountCancelledWarning",
-    "ForgottenWarning",
-    "JudgeError",
-    "Judged",
-    "ReliabilityCallback",
-    "RewardModel",
-    "Tally",
-    "UncertaintyDiscountedReward",
-    "UnscoredWarning",
-    "UselessJudgeWarning",
-    "advantage_change",
-    "keeps_factor",
-]
 
 DISCOUNTED = 0.9  # a group whose mean weight is below this is discounted
 CANCELLED = 0.05  # and its discount cancelled, if the normalised advantages change by less than this
@@ -246,13 +231,13 @@ class UncertaintyDiscountedReward:
             allowed = f"({size},) or ({size}, N) with N >= 2 members"
             raise _checks.InvalidValueError("shape of what sigma_m gave", values.shape, allowed)
         _checks.finite("sigma_m", values)
-        self._members.hear(values)
+        self._members.observe(values)
         return np.std(values, axis=1, ddof=1) / (self._members.deviation or 1.0)
 
     def _discount(self, scores: np.ndarray, sigma_m: np.ndarray) -> Judged:
         here = ~np.isnan(scores)
         for judge, scale in enumerate(self._scales):
-            scale.hear(scores[here[:, judge], judge])
+            scale.observe(scores[here[:, judge], judge])
         rated = np.stack([scale.ratings(column) for scale, column in zip(self._scales, scores.T, strict=True)], 1)
         ratings = np.clip(rated, -self._clip, self._clip)
         raw = self._combine(ratings)

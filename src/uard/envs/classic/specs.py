@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uard import _checks
-from uard.ratings import panels
+from uard.envs.base import CompiledEnvironment
+from uard.ratings.panels import Panel
 
 if TYPE_CHECKING:
     from uard.envs.classic.world import ClassicWorld
 
 
 @dataclass(frozen=True)
-class CartPole:
+class CartPole(CompiledEnvironment):
     """Keep a pole upright on a cart by pushing it left (0) or right (1); +1 per step, the last one included.
 
     Source: Barto, Sutton and Anderson (1983), as ``CartPole-v1``. An observation is the cart's position (m) and
@@ -40,16 +41,16 @@ class CartPole:
         """
         _checks.whole("horizon", self.horizon, low=1, high=100_000)
 
-    def world(self, panel: str = "main", noise: float = 0.0) -> ClassicWorld:
+    def world(self, panel: Panel, noise: float = 0.0) -> ClassicWorld:
         """Return the compiled world, each step rated by a panel (needs JAX)."""
         from uard.envs.classic.world import CART_POLE, ClassicWorld
 
-        panels.check(panel, noise)
+        _checks.number("noise", noise, low=0)
         return ClassicWorld(np.int32(self.horizon), np.float32(noise), panel, CART_POLE)
 
 
 @dataclass(frozen=True)
-class Acrobot:
+class Acrobot(CompiledEnvironment):
     """Swing a two-link pendulum up with torques -1, 0 or +1 N m (0, 1, 2) at its middle joint; -1 per step.
 
     Source: Sutton (1996) with the equations of Sutton and Barto's book, as ``Acrobot-v1``. An observation is the cosine
@@ -71,9 +72,9 @@ class Acrobot:
         """
         _checks.whole("horizon", self.horizon, low=1, high=100_000)
 
-    def world(self, panel: str = "main", noise: float = 0.0) -> ClassicWorld:
+    def world(self, panel: Panel, noise: float = 0.0) -> ClassicWorld:
         """Return the compiled world, each step rated by a panel (needs JAX)."""
         from uard.envs.classic.world import ACROBOT, ClassicWorld
 
-        panels.check(panel, noise)
+        _checks.number("noise", noise, low=0)
         return ClassicWorld(np.int32(self.horizon), np.float32(noise), panel, ACROBOT)

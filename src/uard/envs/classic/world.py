@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from uard.envs.tables import Ratings
-from uard.envs.world import Step, Verdict
-from uard.ratings import panels
+from uard.envs.world import Evaluation, Step
+from uard.ratings.panels import Panel, RatingLaw
 
 GRAVITY = 9.8  # m/s^2
 
@@ -36,7 +35,7 @@ class Rules(NamedTuple):
     Attributes:
         actions: Number of actions.
         features: Length of an observation.
-        spread: Every number of a first state is drawn from -spread to spread.
+        start: Every number of a first state is drawn from -start to start.
         step: From a state and an action to the state after it, the reward and whether the episode terminates.
         observe: From a state to the observation.
         goal: Whether to terminate is to reach a goal.
@@ -44,7 +43,7 @@ class Rules(NamedTuple):
 
     actions: int
     features: int
-    spread: float
+    start: float
     step: Callable[[Array, Array], tuple[Array, Array, Array]]
     observe: Callable[[Array], Array]
     goal: bool
@@ -61,13 +60,13 @@ class ClassicWorld:
     Attributes:
         horizon: Steps per episode.
         noise: Standard deviation of extra noise on every rater, in reward units.
-        panel: Name of the panel.
+        panel: Who rates.
         rules: Which problem it is.
     """
 
     horizon: Array | np.integer
     noise: Array | np.floating
-    panel: str = field(metadata={"static": True})
+    panel: Panel = field(metadata={"static": True})
     rules: Rules = field(metadata={"static": True})
 
     @property
@@ -83,7 +82,7 @@ class ClassicWorld:
     @property
     def raters(self) -> int:
         """Number of annotators."""
-        return panels.raters(self.panel)
+        return len(self.panel.raters)
 
     @property
     def slots(self) -> int:
@@ -92,7 +91,7 @@ class ClassicWorld:
 
     def reset(self, key: Array) -> Array:
         """Draw a first state."""
-        return jax.random.uniform(key, (4,), jnp.float32, -self.rules.spread, self.rules.spread)
+        return jax.random.uniform(key, (4,), jnp.float32, -self.rules.start, self.rules.start)
 
     def step(self, state: Array, action: Array, key: Array) -> Step:
         """Take one step, in which nothing is random."""
@@ -106,13 +105,13 @@ class ClassicWorld:
         """Return 0."""
         return jnp.int32(0)
 
-    def judge(self, state: Array, action: Array, after: Step) -> Verdict:
+    def evaluate(self, state: Array, action: Array, after: Step) -> Evaluation:
         """Repeat the observed reward; there is no hack."""
-        return Verdict(after.reward, jnp.zeros((), bool), after.terminated & self.rules.goal)
+        return Evaluation(after.reward, jnp.zeros((), bool), after.terminated & self.rules.goal)
 
-    def rate(self, state: Array, action: Array, after: Step) -> Ratings:
-        """Return what the panel says."""
-        return panels.say(self.panel, after.reward, after.reward, jnp.zeros(after.reward.shape, bool), self.noise)
+    def rating_law(self, state: Array, action: Array, after: Step) -> RatingLaw:
+        """Return how the panel answers."""
+        return self.panel.law(after.reward, after.reward, jnp.zeros(after.reward.shape, bool), self.noise)
 
 
 def _push(state: Array, action: Array) -> tuple[Array, Array, Array]:

@@ -27,7 +27,7 @@ import numpy as np
 
 from uard import _checks
 from uard.envs.grids.trapgrid import MOVES, PAPER_TRAPS, TrapGrid
-from uard.ratings import panels
+from uard.ratings.panels import Panel, as_panel, draw
 
 Cell = Sequence[int]
 
@@ -61,7 +61,7 @@ class TrapGridEnv(gymnasium.Env[int, int]):
 
     Attributes:
         grid: The spec, a frozen ``TrapGrid``.
-        panel: Name of the panel, or None.
+        panel: Who rates, or None.
         render_mode: ``rgb_array`` (an (H, W, 3) picture), ``ansi`` (text) or None.
     """
 
@@ -80,7 +80,7 @@ class TrapGridEnv(gymnasium.Env[int, int]):
         start: Cell = (0, 0),
         horizon: int | None = None,
         legitimate: bool = False,
-        panel: str | None = None,
+        panel: str | Panel | None = None,
         noise: float = 0.0,
         render_mode: str | None = None,
     ):
@@ -97,7 +97,7 @@ class TrapGridEnv(gymnasium.Env[int, int]):
             start: The start's cell.
             horizon: Steps per episode, >= 1; the paper's for its sizes if left out, else 8 per side.
             legitimate: The twin in which the traps' reward is real.
-            panel: Who rates each step, a name in ``uard.ratings.panels.PANELS``; nobody if left out.
+            panel: Who rates each step, a ``Panel`` or a name in ``uard.ratings.panels.PANELS``; nobody if left out.
             noise: Standard deviation of extra normal noise on every rater, in reward units, >= 0.
             render_mode: ``rgb_array``, ``ansi`` or None.
 
@@ -118,11 +118,11 @@ class TrapGridEnv(gymnasium.Env[int, int]):
             legitimate=legitimate,
         )
         _checks.number("noise", noise, low=0)
-        self.panel = panel
-        self._ratings = None
-        if panel is not None:
-            said = panels.ratings(panel, self.grid.task(), self.grid.truth(), noise)
-            self._ratings = said.centre.astype(float), said.deviation.astype(float)
+        self.panel = None if panel is None else as_panel(panel)
+        self._law = None
+        if self.panel is not None:
+            law = self.grid.rating_law(self.panel, noise)
+            self._law = law._replace(centre=law.centre.astype(float), deviation=law.deviation.astype(float))
         if render_mode is not None:
             _checks.choose("render_mode", render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
@@ -175,9 +175,8 @@ class TrapGridEnv(gymnasium.Env[int, int]):
         self._running = not (terminated or truncated)
 
         info: dict[str, Any] = {"evaluation": Evaluation(true_reward, hack)}
-        if self._ratings is not None:
-            centre, deviation = (table[place, action] for table in self._ratings)
-            info["ratings"] = centre + deviation * self.np_random.standard_normal(centre.shape)
+        if self._law is not None:
+            info["ratings"] = draw(self._law.at(place, action), self.np_random)
         return grid.state(cell), reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | str | None:  # type: ignore[override]

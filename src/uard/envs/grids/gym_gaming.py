@@ -30,7 +30,7 @@ from uard.envs.grids.gaming import (
     TomatoWatering,
 )
 from uard.envs.grids.gym import Evaluation
-from uard.ratings import panels
+from uard.ratings.panels import Panel, as_panel, draw
 
 Cell = tuple[int, int]
 
@@ -91,18 +91,18 @@ class GamingEnv(gymnasium.Env[Any, int]):
 
     Attributes:
         problem: The spec, frozen.
-        panel: Name of the panel, or None.
+        panel: Who rates, or None.
         render_mode: ``ansi`` (text) or None.
     """
 
     metadata = {"render_modes": ["ansi"], "render_fps": 8}  # noqa: RUF012
 
-    def __init__(self, rules: Rules, *, panel: str | None, noise: float, render_mode: str | None):
+    def __init__(self, rules: Rules, *, panel: str | Panel | None, noise: float, render_mode: str | None):
         """Build the environment; ``boat_race`` and its like are the usual way.
 
         Args:
             rules: The problem.
-            panel: Who rates each step, a name in ``uard.ratings.panels.PANELS``; nobody if None.
+            panel: Who rates each step, a ``Panel`` or a name in ``uard.ratings.panels.PANELS``; nobody if None.
             noise: Standard deviation of extra normal noise on every rater, in reward units, >= 0.
             render_mode: ``ansi`` or None.
 
@@ -110,11 +110,11 @@ class GamingEnv(gymnasium.Env[Any, int]):
             InvalidValueError: naming the field, the value and what is allowed.
             UnknownNameError: for an unknown panel or render mode, with the nearest name.
         """
-        panels.check("single" if panel is None else panel, noise)
+        _checks.number("noise", noise, low=0)
         if render_mode is not None:
             _checks.choose("render_mode", render_mode, self.metadata["render_modes"])
         self.problem = rules.spec
-        self.panel = panel
+        self.panel = None if panel is None else as_panel(panel)
         self.render_mode = render_mode
         self.observation_space = rules.observation_space
         self.action_space = gymnasium.spaces.Discrete(len(_STEPS))  # type: ignore[assignment]
@@ -154,8 +154,7 @@ class GamingEnv(gymnasium.Env[Any, int]):
         info: dict[str, Any] = {"evaluation": Evaluation(true_reward, hack)}
         if self.panel is not None:
             step = np.asarray(reward), np.asarray(true_reward), np.asarray(hack)
-            centre, deviation, _ = panels.say(self.panel, *step, self._noise)
-            info["ratings"] = centre + deviation * self.np_random.standard_normal(centre.shape)
+            info["ratings"] = draw(self.panel.law(*step, self._noise), self.np_random)
         return self._rules.observe(self._state), reward, terminated, truncated, info
 
     def render(self) -> str | None:  # type: ignore[override]

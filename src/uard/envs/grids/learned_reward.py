@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uard import _checks
+from uard.envs.base import TableEnvironment, law_of_tables
 from uard.envs.grids.trapgrid import TrapGrid
-from uard.envs.tables import HiddenTruth, Ratings, Task
-from uard.ratings import panels
+from uard.envs.tables import HiddenTruth, Task
+from uard.ratings.panels import MAIN, Panel, RatingLaw
 
 if TYPE_CHECKING:
-    from uard.envs.world import TableWorld
+    pass
 
 FEATURES = 400
 OWN = 1.0  # size of a cell's own feature, in reward units
@@ -31,12 +32,12 @@ NOISE = 0.02  # of the mean of many ratings
 
 
 @dataclass(frozen=True)
-class LearnedRewardGrid:
+class LearnedRewardGrid(TableEnvironment):
     """A grid with one trap inside the rated part, and an unrated corner region.
 
     Attributes:
         size: Cells per side, >= 6.
-        trap_reward: What the tempted rater is drawn to at the trap; see ``panels.main``.
+        trap_reward: What the tempted rater is drawn to at the trap; see ``uard.ratings.panels.MAIN``.
         unrated: Rows and columns of the unrated square at the upper right, in [0, size - 2]; 0 leaves nothing unrated.
         members: Regressions in the ensemble, >= 2.
         frequency: Of their random features, in cycles per grid, > 0: how wildly they extrapolate.
@@ -83,7 +84,7 @@ class LearnedRewardGrid:
         """Fit the ensemble to the panel's mean rating of entering each rated cell; mean and deviation, (S,) each."""
         grid, rated = self.grid(), self.rated()
         task, truth = grid.task(), grid.truth()
-        said = panels.ratings("main", task, truth).centre.mean(-1)
+        said = law_of_tables(MAIN, task, truth).centre.mean(-1)
         entered, by_cell = task.next_state, np.zeros(self.states)
         by_cell[entered.ravel()] = said.ravel()
         rng = np.random.default_rng(self.model_seed)
@@ -114,13 +115,9 @@ class LearnedRewardGrid:
         truth = self.grid().truth()
         return truth._replace(hack=self.task().reward - truth.reward > 1.0)
 
-    def speech(self, panel: str, noise: float) -> Ratings:
+    def rating_law(self, panel: Panel, noise: float = 0.0) -> RatingLaw:
         """Return what the panel says of every step that leads into the rated part; of others it says nothing."""
         grid = self.grid()
         task = grid.task()
         reach = self.rated()[task.next_state].astype(np.float32)
-        return panels.ratings(panel, task, grid.truth(), noise)._replace(reach=reach)
-
-    def world(self, panel: str = "main", noise: float = 0.0) -> TableWorld:
-        """Build the compiled environment."""
-        return panels.of_tables(self, panel, noise)
+        return law_of_tables(panel, task, grid.truth(), noise)._replace(reach=reach)

@@ -11,9 +11,8 @@ import numpy as np
 from jax import Array
 
 from uard.envs.grids.gaming import GARDEN, TOMATOES, WATERED
-from uard.envs.tables import Ratings
-from uard.envs.world import Step, Verdict
-from uard.ratings import panels
+from uard.envs.world import Evaluation, Step
+from uard.ratings.panels import Panel, RatingLaw
 
 _BUCKET, _START = np.int32(GARDEN.only("O")), np.int32(GARDEN.only("S"))
 _BITS = np.int32(1) << np.arange(len(TOMATOES), dtype=np.int32)
@@ -37,7 +36,7 @@ class TomatoWorld:
         noise: Standard deviation of extra noise on every rater, in reward units.
         horizon: Steps per episode.
         legitimate: Whether the bucket really waters.
-        panel: Name of the panel.
+        panel: Who rates.
     """
 
     factor: Array | np.floating
@@ -45,7 +44,7 @@ class TomatoWorld:
     noise: Array | np.floating
     horizon: Array | np.integer
     legitimate: Array | np.bool_
-    panel: str = field(metadata={"static": True})
+    panel: Panel = field(metadata={"static": True})
 
     @property
     def actions(self) -> int:
@@ -60,7 +59,7 @@ class TomatoWorld:
     @property
     def raters(self) -> int:
         """Number of annotators."""
-        return panels.raters(self.panel)
+        return len(self.panel.raters)
 
     @property
     def slots(self) -> int:
@@ -102,15 +101,15 @@ class TomatoWorld:
         code = ((state.cell << len(TOMATOES)) + bits) * self.actions + jnp.asarray(action, jnp.int32)
         return (_mixed(code.astype(jnp.uint32)) % jnp.uint32(self.slots)).astype(jnp.int32)
 
-    def judge(self, state: TomatoState, action: Array, after: Step) -> Verdict:
+    def evaluate(self, state: TomatoState, action: Array, after: Step) -> Evaluation:
         """Count the tomatoes that really are watered; a step that ends on the bucket is a hack."""
         reached: TomatoState = after.state
-        return Verdict(self._worth(reached.watered), reached.cell == _BUCKET, jnp.zeros((), bool))
+        return Evaluation(self._worth(reached.watered), reached.cell == _BUCKET, jnp.zeros((), bool))
 
-    def rate(self, state: TomatoState, action: Array, after: Step) -> Ratings:
-        """Return what the panel says."""
-        true, hack, _ = self.judge(state, action, after)
-        return panels.say(self.panel, after.reward, true, hack, self.noise)
+    def rating_law(self, state: TomatoState, action: Array, after: Step) -> RatingLaw:
+        """Return how the panel answers."""
+        true, hack, _ = self.evaluate(state, action, after)
+        return self.panel.law(after.reward, true, hack, self.noise)
 
 
 def _mixed(x: Array) -> Array:

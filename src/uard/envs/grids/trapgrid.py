@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uard import _checks
-from uard.envs.tables import HiddenTruth, Ratings, Task
-from uard.ratings import panels
+from uard.envs.base import TableEnvironment
+from uard.envs.tables import HiddenTruth, Task
 
 if TYPE_CHECKING:
-    from uard.envs.world import TableWorld
+    pass
 
 MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])  # up, down, left, right
 PAPER_TRAPS = {6: ((3, 3),), 8: ((3, 3), (5, 6)), 10: ((3, 3), (5, 6), (7, 4))}
@@ -25,7 +25,7 @@ PAPER_HORIZON = {6: 40, 8: 60, 10: 80}
 
 
 @dataclass(frozen=True)
-class TrapGrid:
+class TrapGrid(TableEnvironment):
     """A square grid with a goal and traps.
 
     Attributes:
@@ -123,14 +123,6 @@ class TrapGrid:
         hack = np.isin(entered, [self.state(t) for t in self.traps or ()])
         reward = self._by_cell(self.trap_reward if self.legitimate else self.true_trap_reward)[entered]
         return HiddenTruth(reward, hack, entered == self.state(self.goal))  # type: ignore[arg-type]
-
-    def world(self, panel: str = "main", noise: float = 0.0) -> TableWorld:
-        """Return the compiled world, each step rated by a panel (needs JAX)."""
-        return panels.of_tables(self, panel, noise)
-
-    def speech(self, panel: str, noise: float) -> Ratings:
-        """Return what the panel says of every step."""
-        return panels.ratings(panel, self.task(), self.truth(), noise)
 
 
 def paper_grid(size: int, trap_reward: float = 4.0, **changes: object) -> TrapGrid:

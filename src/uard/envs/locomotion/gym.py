@@ -15,7 +15,8 @@ import numpy as np
 from uard import _checks
 from uard.envs.grids.gym import Evaluation
 from uard.envs.locomotion import physics as mujoco
-from uard.ratings import panels
+from uard.envs.simulator import rate
+from uard.ratings.panels import Panel, as_panel
 
 
 class LocomotionEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -27,7 +28,7 @@ class LocomotionEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Attributes:
         spec_of: What robot, and how its reward lies.
-        panel: Name of the panel, or None.
+        panel: Who rates, or None.
         render_mode: ``rgb_array`` (an (H, W, 3) picture; needs a graphics library, see MUJOCO_GL) or None.
     """
 
@@ -41,7 +42,7 @@ class LocomotionEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         legitimate: bool = False,
         version: int = 4,
         horizon: int = 1000,
-        panel: str | None = None,
+        panel: str | Panel | None = None,
         noise: float = 0.0,
         render_mode: str | None = None,
     ):
@@ -53,7 +54,7 @@ class LocomotionEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             legitimate: The twin in which the region's bonus is real.
             version: Of Gymnasium's task, 4 or 5.
             horizon: Steps per episode, >= 1.
-            panel: Who rates each step, a name in ``uard.ratings.panels.PANELS``; nobody if left out.
+            panel: Who rates each step, a ``Panel`` or a name in ``uard.ratings.panels.PANELS``; nobody if left out.
             noise: Standard deviation of extra normal noise on every rater, in reward units, >= 0.
             render_mode: ``rgb_array`` or None.
 
@@ -65,12 +66,11 @@ class LocomotionEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             region = REGIONS[region]()
         lies: Any = region
         self.spec_of = mujoco.Locomotion(robot, version, lies, legitimate=legitimate, horizon=horizon)
-        if panel is not None:
-            _checks.choose("panel", panel, panels.PANELS)
         _checks.number("noise", noise, low=0)
         if render_mode is not None:
             _checks.choose("render_mode", render_mode, self.metadata["render_modes"])
-        self.panel, self.noise, self.render_mode = panel, noise, render_mode
+        self.panel = None if panel is None else as_panel(panel)
+        self.noise, self.render_mode = noise, render_mode
         features, motors = self.spec_of.features, self.spec_of.actions
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (features,), np.float64)  # type: ignore[assignment]
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (motors,), np.float32)  # type: ignore[assignment]
@@ -103,9 +103,9 @@ class LocomotionEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         moved = self._physics.step(np.asarray(action)[None])
         terminated, truncated = bool(moved.terminated[0]), bool(moved.truncated[0])
         self._running = not (terminated or truncated)
-        info: dict[str, Any] = {"evaluation": Evaluation(float(moved.true[0]), bool(moved.hack[0]))}
+        info: dict[str, Any] = {"evaluation": Evaluation(float(moved.true_reward[0]), bool(moved.hack[0]))}
         if self.panel is not None:
-            info["ratings"] = mujoco.rate(self.panel, moved, self.noise, self.np_random)[0]
+            info["ratings"] = rate(self.panel, moved, self.noise, self.np_random)[0]
         return moved.observation[0], float(moved.reward[0]), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]

@@ -29,8 +29,8 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from uard import _checks
-from uard.envs.tables import Ratings
-from uard.ratings import panels
+from uard.envs.base import SimulatedEnvironment
+from uard.envs.simulator import Simulator, StepResult
 
 Array = np.ndarray
 INSTALL = "pip install 'uard[mujoco]'"
@@ -183,7 +183,7 @@ class Kick:
 
 
 @dataclass(frozen=True)
-class Locomotion:
+class Locomotion(SimulatedEnvironment):
     """A robot that is to run forward, and how its reward lies.
 
     Attributes:
@@ -228,31 +228,13 @@ class Locomotion:
         """Number of motors."""
         return {"hopper": 3, "walker2d": 6}[self.robot]
 
+    def simulator(self, copies: int, seed: int, threads: int = 1) -> Physics:
+        """Build the physics."""
+        return Physics(self, copies, seed, threads)
+
     def honest(self) -> Locomotion:
         """Return the uncorrupted control: no region, no spikes."""
         return replace(self, region=None, spikes=None, legitimate=False)
-
-
-class Moved(NamedTuple):
-    """What all copies' steps led to; leaves (E, ...).
-
-    Attributes:
-        observation: (E, features) float64, after the step and before any reset.
-        reward: Observed.
-        terminated: Whether the robot fell.
-        truncated: Whether the horizon was reached (and the robot did not fall).
-        true: True reward; for evaluation and for the panel only.
-        hack: Whether the copy is in the region; for evaluation and for the panel only.
-        task: Gymnasium's own reward; for evaluation only.
-    """
-
-    observation: Array
-    reward: Array
-    terminated: Array
-    truncated: Array
-    true: Array
-    hack: Array
-    task: Array
 
 
 def _mujoco() -> Any:
@@ -280,7 +262,7 @@ def model(robot: str, version: int) -> Any:
     return loaded
 
 
-class Physics:
+class Physics(Simulator):
     """Several copies of a robot, stepped together.
 
     Every copy is reset by itself when its episode ends. ``save`` gives all that the future depends on, to the bit.
@@ -345,7 +327,7 @@ class Physics:
         """Return the observations of all copies, (E, features)."""
         return np.concatenate([self._position[:, 1:], np.clip(self._velocity, -10, 10)], axis=1)
 
-    def step(self, actions: Array) -> Moved:
+    def step(self, actions: Array) -> StepResult:
         """Take one step in every copy, actions (E, motors) in [-1, 1]; copies whose episode ended begin a new one.
 
         Raises:
@@ -392,7 +374,7 @@ class Physics:
         truncated = (self._time >= spec.horizon) & ~terminated
         for i in np.nonzero(terminated | truncated)[0]:
             self.reset(int(i))
-        return Moved(observation, reward, terminated, truncated, true, hack, task)
+        return StepResult(observation, reward, terminated, truncated, true, hack, truncated, task)
 
     def _healthy(self, observation: Array) -> Array:
         height, pitch, r = self._position[:, 1], self._position[:, 2], self._robot
@@ -457,12 +439,6 @@ class Physics:
         """Let the threads go."""
         if self._pool:
             self._pool.shutdown()
-
-
-def rate(panel: str, moved: Moved, noise: float, random: np.random.Generator) -> Array:
-    """Return a panel's ratings of all copies' steps, (E, K)."""
-    said: Ratings = panels.say(panel, moved.reward, moved.true, moved.hack, np.asarray(noise))
-    return said.centre + said.deviation * random.standard_normal(said.centre.shape)
 
 
 def cores() -> int:

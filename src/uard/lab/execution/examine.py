@@ -18,9 +18,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from uard.envs.locomotion.physics import Moved, Physics
+from uard.envs.simulator import StepResult
 from uard.method import calibration
-from uard.method.mitigations import Evidence, Feedback, RatedReward, RewardDiscounting
+from uard.method.mitigations import Evidence, Feedback, RatedReward
+from uard.ratings.aggregate import nothing
 
 STEPS = 1000
 WINDOWS = ((200, 220), (400, 420), (750, 770))
@@ -67,15 +68,15 @@ class Walked(NamedTuple):
 
     observation: np.ndarray
     action: np.ndarray
-    moved: Moved
+    result: StepResult
 
 
-def examine(job: Any, live: Any) -> dict[str, np.ndarray]:
+def examine(loop: Any, state: Any) -> dict[str, np.ndarray]:
     """Examine a trained agent.
 
     Args:
-        job: The run, a ``training.host.Job``.
-        live: Its last state.
+        loop: Of the run, a ``training.host.loop.Loop``.
+        state: Its last state.
 
     Returns:
         ``trace`` (STEPS, len(TRACE)) of the distorted walk; ``perturbed`` (len(EPSILONS), len(PERTURBED)): means over
@@ -83,65 +84,68 @@ def examine(job: Any, live: Any) -> dict[str, np.ndarray]:
         larger at a state thrown off by ``THROWN`` than at a visited one, and where the value is among the most wrong
         quarter than elsewhere.
     """
-    judge = _Judge(job, live)
-    own, rival = _walk(job, live, judge.loop)
-    observed = own.moved.reward + BONUS * inside()
-    adjusted, caution, lam = judge(own, observed)
-    trace = np.column_stack([observed, adjusted, caution, lam, own.moved.true])
-    found = {"trace": trace, "perturbed": _perturbed(judge, own, rival), "warning": _warning(judge, own)}
+    reward_fn = _RewardFn(loop, state)
+    own, rival = _walk(loop, state)
+    observed = own.result.reward + BONUS * inside()
+    adjusted, caution, lam = reward_fn(own, observed)
+    trace = np.column_stack([observed, adjusted, caution, lam, own.result.true_reward])
+    found = {"trace": trace, "perturbed": _perturbed(reward_fn, own, rival), "warning": _warning(reward_fn, own)}
     return {name: value.astype(np.float32) for name, value in found.items()}
 
 
-def _walk(job: Any, live: Any, loop: Any) -> tuple[Walked, Walked]:
+def _walk(loop: Any, state: Any) -> tuple[Walked, Walked]:
     """Return the agent's steps, and what a random action would have led to in every ``EVERY``-th of its states."""
     from uard.training.host import loop as host
 
+    job = loop.job
     random = host.generator(job.seed, host.EVALUATION, 1)
-    physics = Physics(job.spec, 1, int(random.integers(2**63)))
+    simulator = job.environment.simulator(1, int(random.integers(2**63)))
     own: list[Walked] = []
     rival: list[Walked] = []
     for t in range(STEPS):
-        here = physics.observe()
+        here = simulator.observe()
         if t % EVERY == 0:
-            saved = physics.save()
-            other = random.uniform(-1.0, 1.0, (1, job.spec.actions))
-            rival.append(Walked(here, other, physics.step(other)))
-            physics.load(saved)
-        action = np.clip(loop.act(live, here), -1.0, 1.0)
-        own.append(Walked(here, action, physics.step(action)))
+            saved = simulator.save()
+            other = random.uniform(-1.0, 1.0, (1, job.environment.actions))
+            rival.append(Walked(here, other, simulator.step(other)))
+            simulator.load(saved)
+        action = np.clip(loop.act(state, here), -1.0, 1.0)
+        own.append(Walked(here, action, simulator.step(action)))
     return _joined(own), _joined(rival)
 
 
 def _joined(steps: list[Walked]) -> Walked:
-    observation, action, moved = zip(*steps, strict=True)
+    observation, action, results = zip(*steps, strict=True)
     return Walked(
-        np.concatenate(observation), np.concatenate(action), Moved(*map(np.concatenate, zip(*moved, strict=True)))
+        np.concatenate(observation),
+        np.concatenate(action),
+        StepResult(*map(np.concatenate, zip(*results, strict=True))),
     )
 
 
-class _Judge:
+class _RewardFn:
     """The filter of a trained agent, by itself."""
 
-    def __init__(self, job: Any, live: Any):
+    def __init__(self, loop: Any, state: Any):
         import jax
 
         from uard.training.feedback import transition_model as transitions
-        from uard.training.host import loop as host
 
-        self.job, self.live, self.loop = job, live, host.bind(job)
+        self.job, self.state, self.loop = loop.job, state, loop
+        job = self.job
         self.raters = job.fixed.raters
-        self.read = jax.jit(partial(transitions.read, job.feedback, raters=self.raters))
-        self.usual: dict[Any, Any] = {job.mitigation: ()}
-        if job.listens:
-            measure = jax.jit(transitions.usual, static_argnames=("mitigation", "spec", "raters"))
-            kept, seen = live.reservoir.inputs, live.reservoir.seen[0]
+        self.read = jax.jit(partial(transitions.read, job.rating_model, raters=self.raters))
+        self.statistics: dict[Any, Any] = {job.mitigation: ()}
+        if job.asks_raters:
+            measure = jax.jit(transitions.panel_statistics, static_argnames=("mitigation", "spec", "raters"))
+            sample, seen = state.reservoir.inputs, state.reservoir.seen[0]
             for m in (job.mitigation, CAUTION):
-                found = measure(m, job.feedback, live.model, kept, seen, raters=self.raters)
-                self.usual[m] = jax.tree.map(lambda x: np.asarray(x, float), found)
+                found = measure(m, job.rating_model, state.model, sample, seen, raters=self.raters)
+                self.statistics[m] = jax.tree.map(lambda x: np.asarray(x, float), found)
 
     def opinions(self, observations: np.ndarray) -> np.ndarray:
         """Return all critics' values, (N, B)."""
-        return np.asarray(self.loop.values(self.live, observations), float)
+        return np.asarray(self.loop.values(self.state, observations), float)
 
     def value(self, observations: np.ndarray) -> np.ndarray:
         """Return their mean, (B,)."""
@@ -156,42 +160,41 @@ class _Judge:
         """Return what the agent and a static pessimist would learn from steps so rewarded, and lambda_t; (B,) each."""
         from uard.training.feedback import transition_model as transitions
 
-        agent, mitigation, moved = self.job.agent, self.job.mitigation, steps.moved
-        ahead = np.where(moved.terminated, 0.0, agent.gamma * self.doubt(moved.observation))
+        agent, mitigation, result = self.job.agent, self.job.mitigation, steps.result
+        ahead = np.where(result.terminated, 0.0, agent.gamma * self.doubt(result.observation))
         evidence = Evidence(reward, ahead, self._feedback(steps, reward))
-        usual = {m: transitions.expecting(u, evidence.feedback) for m, u in self.usual.items()}
-        adjusted = np.asarray(mitigation.signal(evidence, usual[mitigation]).reward, float)
+        statistics = {m: transitions.expecting(s, evidence.feedback) for m, s in self.statistics.items()}
+        why = mitigation.explain(evidence, statistics[mitigation])
+        adjusted = np.asarray(why.signal.reward, float)
         opinions = self.opinions(steps.observation)
         if heat := getattr(agent, "backup_temperature", 0.0):
             adjusted = adjusted * backup_trust(opinions.std(0, ddof=1), heat)
         elif getattr(agent, "diversity", 0.0):
             adjusted = adjusted - (opinions.mean(0) - opinions.min(0))
-        caution, lam = reward, np.zeros(len(reward))
-        if self.job.listens:
-            caution = np.asarray(CAUTION.signal(evidence, usual[CAUTION]).reward)
-        if isinstance(mitigation, RewardDiscounting):
-            lam = lam + np.asarray(mitigation.explain(evidence, usual[mitigation]).lam)
-        return adjusted, caution, lam
+        caution = reward
+        if self.job.asks_raters:
+            caution = np.asarray(CAUTION.signal(evidence, statistics[CAUTION]).reward)
+        return adjusted, caution, np.zeros(len(reward)) + np.asarray(why.lam)
 
     def _feedback(self, steps: Walked, reward: np.ndarray) -> Feedback:
         from uard.training.feedback import transition_model as transitions
 
-        if not self.job.listens:
-            return Feedback._make([*np.zeros((5, len(reward))), np.float64(self.raters)])
-        told = transitions.features(steps.observation, steps.action, steps.moved.observation, reward)
-        return Feedback._make([np.asarray(x, float) for x in self.read(self.live.model, told.astype(np.float32))])
+        if not self.job.asks_raters:
+            return nothing((len(reward),), self.raters)
+        inputs = transitions.features(steps.observation, steps.action, steps.result.observation, reward)
+        return self.read(self.state.model, inputs.astype(np.float32)).map(lambda x: np.asarray(x, float))
 
 
-def _perturbed(judge: _Judge, own: Walked, rival: Walked) -> np.ndarray:
-    chosen = Walked(own.observation[::EVERY], own.action[::EVERY], Moved(*(x[::EVERY] for x in own.moved)))
+def _perturbed(reward_fn: _RewardFn, own: Walked, rival: Walked) -> np.ndarray:
+    chosen = Walked(own.observation[::EVERY], own.action[::EVERY], StepResult(*(x[::EVERY] for x in own.result)))
     ahead, ahead_of_rival = (
-        np.where(w.moved.terminated, 0.0, judge.job.agent.gamma * judge.value(w.moved.observation))
+        np.where(w.result.terminated, 0.0, reward_fn.job.agent.gamma * reward_fn.value(w.result.observation))
         for w in (chosen, rival)
     )
-    raised = rival.moved.reward + EPSILONS[:, None]
-    filtered = judge(chosen, chosen.moved.reward)[0] - np.array([judge(rival, r)[0] for r in raised])
+    raised = rival.result.reward + EPSILONS[:, None]
+    filtered = reward_fn(chosen, chosen.result.reward)[0] - np.array([reward_fn(rival, r)[0] for r in raised])
     columns = []
-    for gap in (filtered, chosen.moved.reward - raised):
+    for gap in (filtered, chosen.result.reward - raised):
         gaps = (gap + ahead - ahead_of_rival)[:, gap[0] + ahead - ahead_of_rival > 0]
         none = np.zeros(len(EPSILONS))
         columns.append((gaps.mean(1), (gaps > 0).mean(1)) if gaps.size else (none, none))
@@ -199,21 +202,21 @@ def _perturbed(judge: _Judge, own: Walked, rival: Walked) -> np.ndarray:
     return np.column_stack([gap_filtered, gap_raw, kept_filtered, kept_raw])
 
 
-def _warning(judge: _Judge, own: Walked) -> np.ndarray:
+def _warning(reward_fn: _RewardFn, own: Walked) -> np.ndarray:
     from uard.training.host import loop as host
 
-    random = host.generator(judge.job.seed, host.EVALUATION, 2)
+    random = host.generator(reward_fn.job.seed, host.EVALUATION, 2)
     rows, width = own.observation.shape
     thrown = own.observation.copy()
     thrown[np.arange(rows), random.integers(width, size=rows)] += THROWN * random.choice([-1.0, 1.0], rows)
-    sigma = judge.doubt(own.observation)
-    new = calibration.auroc(np.concatenate([sigma, judge.doubt(thrown)]), np.arange(2 * rows) >= rows)
-    reward, moved = judge(own, own.moved.reward)[0], own.moved
-    after, value = judge.value(moved.observation), judge.value(own.observation)
-    earned, following = np.zeros(rows), after[-1]
+    sigma = reward_fn.doubt(own.observation)
+    new = calibration.auroc(np.concatenate([sigma, reward_fn.doubt(thrown)]), np.arange(2 * rows) >= rows)
+    reward, result = reward_fn(own, own.result.reward)[0], own.result
+    after, value = reward_fn.value(result.observation), reward_fn.value(own.observation)
+    earned, next_return = np.zeros(rows), after[-1]
     for t in range(rows - 1, -1, -1):
-        following = 0.0 if moved.terminated[t] else after[t] if moved.truncated[t] else following
-        following = earned[t] = reward[t] + judge.job.agent.gamma * following
+        next_return = 0.0 if result.terminated[t] else after[t] if result.truncated[t] else next_return
+        next_return = earned[t] = reward[t] + reward_fn.job.agent.gamma * next_return
     error = np.abs(value - earned - np.median(value - earned))
     wrong = error > np.quantile(error, WORST)
     return np.array([new, calibration.auroc(sigma, wrong) if wrong.any() else 0.5])

@@ -7,27 +7,23 @@ from typing import Any
 import numpy as np
 
 from uard.agents.tabular import QLearning
-from uard.envs.base import Tables
+from uard.envs.base import TableEnvironment
 from uard.envs.tables import HiddenTruth, Task
 from uard.lab.cell import Cell
 from uard.lab.execution.examine import examine
 from uard.lab.result import DivergedError, Result
 from uard.method import calibration, uncertainty
 from uard.method.mitigations import Feedback, Mitigation
-
-
-def read_feedback(rows: np.ndarray, raters: int) -> Feedback:
-    """Read the learner's rating table (S, A, 5) on the host."""
-    count, mean, lowest, spread, proxy = np.moveaxis(rows, -1, 0)
-    return Feedback(count, mean, lowest, spread, proxy, np.float32(raters))
+from uard.ratings.aggregate import aggregate
+from uard.ratings.panels import draw
 
 
 def greedy_path(task: Task, agent: QLearning, mitigation: Mitigation, q: np.ndarray, feedback: Feedback) -> np.ndarray:
     """Return the states that the trained agent visits without exploring, the start included."""
-    usual = mitigation.usual(feedback, feedback.count > 0)
+    statistics = mitigation.fit(feedback, feedback.count > 0)
     mu = q.mean(-1)
     sigma = q.std(-1, ddof=1) if agent.heads > 1 else np.zeros_like(mu)
-    policy = np.asarray(mitigation.score(mu, sigma, feedback, usual)).argmax(-1)
+    policy = np.asarray(mitigation.score(mu, sigma, feedback, statistics)).argmax(-1)
     path = [int(np.atleast_1d(task.start)[0])]
     for _ in range(int(task.horizon)):
         place = path[-1], policy[path[-1]]
@@ -37,17 +33,17 @@ def greedy_path(task: Task, agent: QLearning, mitigation: Mitigation, q: np.ndar
     return np.array(path, np.int32)
 
 
-def finish(cell: Cell, task: Task, truth: HiddenTruth, raters: int, out: dict[str, Any]) -> Result:
+def finish(cell: Cell, task: Task, truth: HiddenTruth, out: dict[str, Any]) -> Result:
     """Turn a trained lane into a result: greedy path, calibration, curves of both uncertainties."""
     states = task.next_state.shape[0]
     if not (np.isfinite(out["log"]).all() and np.isfinite(out["q"]).all()):
         raise FloatingPointError(f"training diverged: NaN or infinity in the values or the log of {cell}")
-    feedback = read_feedback(out["feedback"][:states], raters)
+    feedback = out["feedback"].map(lambda x: x[:states])
     extra: dict[str, np.ndarray] = {}
     if cell.mitigation.reads_feedback:
         extra["calibration"] = np.array(_calibration(feedback, truth), np.float32)
     if cell.snapshots:
-        extra["uncertainty"] = _uncertainty_curves(out, truth, states, raters)
+        extra["uncertainty"] = _uncertainty_curves(out, truth, states)
     path = greedy_path(task, cell.agent, cell.mitigation, out["q"][:states], feedback)
     return Result(out["log"], int(out["steps"]), path, extra)
 
@@ -55,8 +51,8 @@ def finish(cell: Cell, task: Task, truth: HiddenTruth, raters: int, out: dict[st
 def _calibration(feedback: Feedback, truth: HiddenTruth) -> list[float]:
     seen = feedback.count > 0
     hack, error = truth.hack[seen], np.abs(feedback.proxy - truth.reward)[seen]
-    sigma = feedback.spread[seen]
-    joint = np.asarray(uncertainty.with_proxy(feedback.mean, feedback.spread, feedback.proxy, feedback.raters))[seen]
+    sigma = feedback.sd[seen]
+    joint = np.asarray(uncertainty.with_proxy(feedback.mean, feedback.sd, feedback.proxy, feedback.raters))[seen]
     if hack.size < 2:
         return [0.5, 0.5, 0.0, 0.0]
     both = bool(hack.any() and not hack.all())
@@ -64,15 +60,15 @@ def _calibration(feedback: Feedback, truth: HiddenTruth) -> list[float]:
     return ranks + [calibration.spearman(s, error) for s in (sigma, joint)]
 
 
-def _uncertainty_curves(out: dict[str, Any], truth: HiddenTruth, states: int, raters: int) -> np.ndarray:
+def _uncertainty_curves(out: dict[str, Any], truth: HiddenTruth, states: int) -> np.ndarray:
     """Mean sigma_m and sigma_h at hacks and elsewhere, (snapshots, 4), over state-actions seen so far."""
     rows = []
-    for q, table in zip(out["q_snapshots"], out["feedback_snapshots"], strict=True):
-        feedback = read_feedback(table[:states], raters)
+    for i, q in enumerate(out["q_snapshots"]):
+        feedback = out["feedback_snapshots"].map(lambda x, i=i: x[i, :states])
         sigma_m = q[:states].std(-1, ddof=1) if q.shape[-1] > 1 else np.zeros(q[:states].shape[:-1])
         seen = feedback.count > 0
         row = []
-        for sigma in (sigma_m, feedback.spread):
+        for sigma in (sigma_m, feedback.sd):
             for where in (truth.hack & seen, ~truth.hack & seen):
                 row.append(sigma[where].mean() if where.any() else 0.0)
         rows.append(row)
@@ -103,7 +99,7 @@ def finish_deep(cell: Cell, seed: int, out: dict[str, Any]) -> Result:
     extra: dict[str, np.ndarray] = {}
     slots, rewards = out["walk"]
     path = np.zeros(0, np.int32)
-    if isinstance(cell.environment, Tables):
+    if isinstance(cell.environment, TableEnvironment):
         task, truth = cell.environment.task(), cell.environment.truth()
         path = _walked(task, slots)
         extra["tables"] = _tables(task, out)
@@ -114,10 +110,10 @@ def finish_deep(cell: Cell, seed: int, out: dict[str, Any]) -> Result:
     return Result(log, int(out["steps"]), path, extra)
 
 
-def finish_host(job: Any, done: Any) -> Result:
-    """Turn a run in MuJoCo into a result; ``evaluation`` and ``ends`` are those of ``training.host.Done``."""
-    extra = {"evaluation": done.evaluation.astype(np.float32), "ends": done.ends} | examine(job, done.live)
-    return Result(done.log.astype(np.float32), int(done.live.steps), np.zeros(0, np.int32), extra)
+def finish_host(loop: Any, trained: Any) -> Result:
+    """Turn a ``training.host.loop.TrainedRun`` into a result."""
+    extra = {"evaluation": trained.evaluation.astype(np.float32), "ends": trained.ends} | examine(loop, trained.state)
+    return Result(trained.log.astype(np.float32), int(trained.state.steps), np.zeros(0, np.int32), extra)
 
 
 def arrays_by_place(tree: Any) -> dict[str, np.ndarray]:
@@ -140,21 +136,22 @@ def _tables(task: Task, out: dict[str, Any]) -> np.ndarray:
     states, actions = task.next_state.shape
     rated = np.asarray(out["rated"])
     rated = rated.reshape(-1, actions) if rated.size > 1 else np.zeros((states, actions))
-    columns = [*out["feedback"][:5], *out["values"], rated]
+    f = out["feedback"]
+    columns = [f.count, f.mean, f.lowest, f.sd, f.proxy, *out["values"], rated]
     return np.stack([np.asarray(c)[:states] for c in columns], axis=-1).astype(np.float32)
 
 
 def _knowledge(cell: Cell, task: Task, truth: HiddenTruth, out: dict[str, Any]) -> dict[str, np.ndarray]:
     """Calibration of what was learned of the raters: of sigma_h, and of the predicted ratings, rated and not."""
     states, actions = task.next_state.shape
-    known = Feedback(*(np.asarray(x)[:states].astype(float) for x in out["feedback"]))
+    known = out["feedback"].map(lambda x: np.asarray(x)[:states].astype(float))
     rated = np.asarray(out["rated"]).reshape(-1, actions)[:states] > 0
     calibrated = _calibration(known._replace(count=rated.astype(float)), truth)
-    said = cell.environment.speech(cell.panel, cell.noise)
-    draws = said.centre + said.deviation * np.random.default_rng(0).standard_normal((500, *said.centre.shape))
-    spread = draws.std(-1, ddof=0).mean(0) if draws.shape[-1] > 1 else np.zeros(rated.shape)
+    law = cell.environment.rating_law(cell.panel, cell.noise)
+    repeated = law._replace(centre=np.broadcast_to(law.centre, (500, *law.centre.shape)))
+    visits = aggregate(draw(repeated, np.random.default_rng(0)), np.zeros((500, *rated.shape)))
     errors = []
-    for got, meant in ((known.mean, said.centre.mean(-1)), (known.spread, spread)):
+    for got, meant in ((known.mean, law.centre.mean(-1)), (known.sd, visits.sd.mean(0))):
         for where in (rated, ~rated):
             errors.append(np.sqrt(np.mean((got - meant)[where] ** 2)) if where.any() else 0.0)
     both = bool(rated.any() and not rated.all())

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from uard.agents.tabular import QLearning
-from uard.envs.base import Tables
+from uard.envs.base import TableEnvironment
 from uard.envs.tables import MIN_STATES
 from uard.lab.cell import Cell, plain
 from uard.lab.execution.claims import BEAT, Owner
@@ -78,12 +78,12 @@ def shape_of(cell: Cell) -> tuple[Any, int]:
         return "number" if isinstance(value, float) else str(value)
 
     agent, mitigation = structure(plain(cell.agent)), structure(plain(cell.mitigation))
-    if isinstance(cell.environment, Tables):
+    if isinstance(cell.environment, TableEnvironment):
         where: Any = type(cell.environment).__name__, max(MIN_STATES, cell.environment.states)
     else:
         where = structure(plain(cell.environment))
-    raters = 1 if cell.panel == "single" else 3
-    program = (mitigation, agent, where, raters, cell.episodes, cell.ddof, cell.snapshots, str(cell.feedback))
+    raters = len(cell.panel.raters), all(rater.plain for rater in cell.panel.raters)
+    program = (mitigation, agent, where, raters, cell.episodes, cell.ddof, cell.snapshots, str(cell.rating_model))
     if cell.steps is not None:
         return (*program, cell.steps), cell.steps * 1000
     return program, (cell.environment.horizon or 0) * cell.episodes * (1 if _tabular(cell) else 1000)
@@ -132,9 +132,9 @@ def _train_lanes(batch: Sequence[Job], folder: Path | None = None) -> list[Calla
     for cell, seed in batch:
         if cell not in tables:
             spec = cell.environment
-            tables[cell] = spec.task(), spec.truth(), spec.speech(cell.panel, cell.noise)
+            tables[cell] = spec.task(), spec.truth(), spec.rating_law(cell.panel, cell.noise)
         task, truth, ratings = tables[cell]
-        lanes.append(fused.lane(task, ratings, truth, cell.agent, cell.mitigation, seed, cell.rated))
+        lanes.append(fused.make_run(task, ratings, truth, cell.agent, cell.mitigation, seed, cell.rated))
     first = batch[0][0]
     program = fused.Program(first.episodes, first.ddof, first.snapshots)
     fields = ("log", "steps", "q", "feedback")
@@ -144,7 +144,7 @@ def _train_lanes(batch: Sequence[Job], folder: Path | None = None) -> list[Calla
     finishers = []
     for (cell, _), outcome in zip(batch, out, strict=True):
         task, truth, ratings = tables[cell]
-        finishers.append(partial(finish, cell, task, truth, ratings.centre.shape[-1], outcome))
+        finishers.append(partial(finish, cell, task, truth, outcome))
     return finishers
 
 
@@ -156,6 +156,7 @@ def checkpoint_of(folder: Path, cell: Cell, seed: int) -> Path:
 def _train_host(cell: Cell, seed: int, folder: Path | None) -> Result:
     from uard.lab.execution.finish import finish_host
     from uard.training.host import loop as host
+    from uard.training.host.loops import loop_of
     from uard.training.xla import keep_programs, make_room
 
     keep_programs()
@@ -170,12 +171,13 @@ def _train_host(cell: Cell, seed: int, folder: Path | None) -> Result:
         cell.panel,
         cell.noise,
         cell.rated,
-        cell.feedback if isinstance(cell.feedback, TransitionModel) else TransitionModel(),
+        cell.rating_model if isinstance(cell.rating_model, TransitionModel) else TransitionModel(),
         cell.ddof,
         query=cell.query,
     )
     path = None if folder is None else checkpoint_of(folder, cell, seed)
-    return finish_host(job, host.run(job, path, f"{cell.key} {seed}"))
+    loop = loop_of(job)
+    return finish_host(loop, host.run(loop, path, f"{cell.key} {seed}"))
 
 
 def _train_deep(batch: Sequence[Job]) -> list[Callable[[], Result]]:
@@ -189,13 +191,15 @@ def _train_deep(batch: Sequence[Job]) -> list[Callable[[], Result]]:
     keep_programs()
     first = batch[0][0]
     make_room(shape_of(first)[0])
-    models = {cell: f if isinstance(f := cell.feedback, RatingModel) else None for cell, _ in batch}
+    models = {cell: f if isinstance(f := cell.rating_model, RatingModel) else None for cell, _ in batch}
     worlds = {cell: cell.environment.world(cell.panel, cell.noise) for cell, _ in batch}
     several = [
-        deep.lane(worlds[cell], cell.agent, cell.mitigation, seed, cell.rated, models[cell]) for cell, seed in batch
+        deep.make_run(worlds[cell], cell.agent, cell.mitigation, seed, cell.rated, models[cell]) for cell, seed in batch
     ]
-    loop = off_policy.run if isinstance(first.agent, OffPolicy) else on_policy.run
-    out = lanes.train(several, loop, deep.Program(first.episodes, ddof=first.ddof), deep.Outcome._fields, deep.ROOM)
+    train_one = off_policy.train_one if isinstance(first.agent, OffPolicy) else on_policy.train_one
+    out = lanes.train(
+        several, train_one, deep.Program(first.episodes, ddof=first.ddof), deep.TrainedAgent._fields, deep.ROOM
+    )
     return [partial(finish_deep, cell, seed, outcome) for (cell, seed), outcome in zip(batch, out, strict=True)]
 
 

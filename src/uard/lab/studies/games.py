@@ -36,7 +36,7 @@ def gaming() -> tuple[Row, ...]:
                 named(mitigation),
                 agent,
                 episodes=EPISODES,
-                feedback=None if isinstance(agent, QLearning) else RatingModel(),
+                rating_model=None if isinstance(agent, QLearning) else RatingModel(),
             ),
             game=where,
             agent=name,

@@ -16,6 +16,7 @@ from uard.lab.studies.common import LOCOMOTION_STEPS, PANELS
 from uard.lab.studies.grids import COMPARED
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import named
+from uard.ratings.panels import as_panel
 from uard.training.feedback.rating_model import RatingModel
 
 AGENTS = ("q-learning", "ensemble-dqn", "ppo")  # the first that can work in an environment learns there
@@ -61,11 +62,11 @@ def agents() -> tuple[Row, ...]:
 
 def _crossed(where: str, environment: Any, name: str, agent: Any, panels: tuple[str, ...]) -> list[Row]:
     physical = isinstance(environment, Locomotion)
-    feedback = None if physical or isinstance(agent, QLearning) else RatingModel()
+    rating_model = None if physical or isinstance(agent, QLearning) else RatingModel()
     steps = LOCOMOTION_STEPS if physical else None
     return [
         row(
-            Cell(environment, named(mitigation), agent, panel, feedback=feedback, steps=steps),
+            Cell(environment, named(mitigation), agent, as_panel(panel), rating_model=rating_model, steps=steps),
             environment=where,
             agent=name,
             mitigation=mitigation,

@@ -23,6 +23,7 @@ from uard.lab.execution.store import Store
 from uard.lab.views.tables import number
 from uard.lab.views.templates import HERE, render
 from uard.method.mitigations import NAMED, named
+from uard.ratings.panels import PANELS
 
 RAW = "raw"
 HONEST, COLLUDING, TWIN = "honest raters", "colluding raters", "legitimate twin"
@@ -217,26 +218,33 @@ def _line(
     config: dict[str, Any], known: _Names, seeds: int, failed: int, hacks: Estimate | None, true: Estimate | None
 ) -> Line:
     mitigation = known.of("mitigation", config["mitigation"])
-    twin = config["environment"].get("legitimate", False)
+    panel, twin = panel_name(config["panel"]), config["environment"].get("legitimate", False)
     trained = [f"{config['steps']:,} steps" if "steps" in config else f"{config['episodes']:,} episodes"]
     tabular = "heads" in config["agent"]
     if "steps" not in config and not tabular:
-        trained.append("learned ratings" if "feedback" in config else "running means")
+        trained.append("learned ratings" if "rating_model" in config else "running means")
     trained += [f"{name} {config[name]}" for name in ("ddof", "snapshots") if config[name]]
     return Line(
         known.of("environment", config["environment"]),
         known.of("agent", config["agent"]),
         mitigation,
-        "–" if mitigation == RAW else config["panel"],
+        "–" if mitigation == RAW else panel,
         config["noise"],
         config["rated"],
         ", ".join(trained),
-        TWIN if twin else COLLUDING if config["panel"] == "colluding" else HONEST,
+        TWIN if twin else COLLUDING if panel == "colluding" else HONEST,
         seeds,
         failed,
         hacks,
         true,
     )
+
+
+def panel_name(config: Any) -> str:
+    """Return what the panel of a stored configuration is called; ``of its own`` if it has no name."""
+    if isinstance(config, str):
+        return config
+    return next((name for name, panel in PANELS.items() if plain(panel) == config), "of its own")
 
 
 class _Names:

@@ -126,13 +126,24 @@ def _ledger(evidence: Evidence, entries: Sequence[Entry], verdicts: Mapping[str,
 
 
 def _audit() -> Section:
+    html = render(HERE, "audit.html.j2", checks=[_check(c) for c in audit.run()])
+    return Section("audit", "The paper's arithmetic, recomputed", 120, html, "Arithmetic")
+
+
+def _check(c: audit.Check) -> dict[str, str]:
     def text(values: Mapping[str, Any]) -> str:
         shown = ((k, f"{v:.4g}" if isinstance(v, float | int) else v) for k, v in values.items() if v is not None)
         return "; ".join(f"{k}: {v}" for k, v in shown) or "–"
 
-    checks = [(c.id, c.question, text(c.paper), text(c.recomputed), c.verdict) for c in audit.run()]
-    html = render(HERE, "audit.html.j2", checks=checks)
-    return Section("audit", "The paper's arithmetic, recomputed", 120, html, "Arithmetic")
+    return {
+        "id": c.id,
+        "question": c.question,
+        "printed": text(c.paper),
+        "recomputed": text(c.recomputed),
+        "judgement": f"{c.judgement.verdict} ({c.judgement.count})" if c.judgement else "nothing claimed",
+        "verdict": c.verdict,
+        "parts": audit.one_by_one([*c.parts, *(o for o in c.found if o.opinion)]),
+    }
 
 
 def _text(name: str) -> str:

@@ -11,6 +11,7 @@ from uard.lab.registry import deep_agents
 from uard.lab.studies.common import PANELS, RAW
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import Mitigation, named
+from uard.ratings.panels import as_panel
 from uard.replication.studies import derive
 from uard.training.feedback.rating_model import RatingModel
 
@@ -22,8 +23,8 @@ CURVES = ("observed_return", "trap_visits", "goal")
 
 def cell(environment: object, mitigation: Mitigation, agent: object, **more: object) -> Cell:
     """Build a cell whose agent learns what raters would say."""
-    feedback = None if isinstance(agent, QLearning) else LEARNED
-    return Cell(environment, mitigation, agent, **({"feedback": feedback} | more))  # type: ignore[arg-type]
+    rating_model = None if isinstance(agent, QLearning) else LEARNED
+    return Cell(environment, mitigation, agent, **({"rating_model": rating_model} | more))  # type: ignore[arg-type]
 
 
 def baselines() -> tuple[Row, ...]:
@@ -55,7 +56,7 @@ def mitigated() -> tuple[Row, ...]:
     """``uard`` with one setting, T = 100: three agents with +4 and +8 and both panels, the others with one of each."""
     return tuple(
         row(
-            cell(TrapGrid(size=10, trap_reward=trap, horizon=100), named("uard"), agent, panel=panel),
+            cell(TrapGrid(size=10, trap_reward=trap, horizon=100), named("uard"), agent, panel=as_panel(panel)),
             agent=name,
             trap=trap,
             panel=panel,
@@ -75,7 +76,7 @@ def rivals() -> tuple[Row, ...]:
     """The other mitigations in the hands of two deep agents, very noisy raters, T = 80."""
     return tuple(
         row(
-            cell(paper_grid(10), named(mitigation), AGENTS[agent], panel=panel, noise=1.2),
+            cell(paper_grid(10), named(mitigation), AGENTS[agent], panel=as_panel(panel), noise=1.2),
             agent=agent,
             mitigation=mitigation,
             panel=panel,
@@ -118,7 +119,7 @@ def feedback() -> tuple[Row, ...]:
     """Running means or a model of the ratings, when 1 %, 10 % or all steps are rated."""
     return tuple(
         row(
-            cell(paper_grid(10), named("uard"), ENSEMBLE, rated=rated, feedback=model),
+            cell(paper_grid(10), named("uard"), ENSEMBLE, rated=rated, rating_model=model),
             source=source,
             rated=rated,
         )

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from uard.envs.base import Tables
+from uard.envs.base import TableEnvironment
 from uard.lab.cell import Cell
 from uard.lab.execution import examine
 from uard.lab.result import TABLES, Result
@@ -27,7 +27,7 @@ def sigma_quality(cell: Cell, result: Result) -> tuple[float, float]:
 
     Q* is exact for the observed reward. Needs an agent all of whose steps were rated, so that tried means rated.
     """
-    assert isinstance(cell.environment, Tables)
+    assert isinstance(cell.environment, TableEnvironment)
     held = {name: result.extra["tables"][..., i].astype(float) for i, name in enumerate(TABLES)}
     tried = held["rated"] > 0
     task = cell.environment.task()

@@ -13,6 +13,7 @@ from uard.lab.registry import continuous_agents
 from uard.lab.studies.common import LOCOMOTION_STEPS, PANELS, RAW
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import named
+from uard.ratings.panels import as_panel
 from uard.replication.studies import derive
 from uard.training.feedback.transition_model import QUERIES
 
@@ -84,7 +85,7 @@ def hacking(scale: Scale) -> tuple[Row, ...]:
                     ("raw", lies, RAW, "main"),
                     *((m, lies, named(m), p) for m in ("uard-paper", "uard") for p in PANELS),
                 ):
-                    cell = _cell(where, mitigation, agent, steps, panel=panel)
+                    cell = _cell(where, mitigation, agent, steps, panel=as_panel(panel))
                     rows.append(row(cell, robot=robot, region=which, agent=name, mitigation=label, panel=panel))
     return tuple(rows)
 
@@ -94,7 +95,7 @@ def bonuses(scale: Scale) -> tuple[Row, ...]:
     agent, steps = scale.agents["ppo"]
     return tuple(
         row(
-            _cell(Locomotion(region=region(bonus=bonus)), named(mitigation), agent, steps, panel=panel),
+            _cell(Locomotion(region=region(bonus=bonus)), named(mitigation), agent, steps, panel=as_panel(panel)),
             region=which,
             bonus=bonus,
             mitigation=mitigation,
@@ -153,7 +154,7 @@ def ablation(scale: Scale) -> tuple[Row, ...]:
     }
     return tuple(
         row(
-            _cell(Locomotion(region=region()), named("uard", **changes), *scale.agents[name], panel=panel),
+            _cell(Locomotion(region=region()), named("uard", **changes), *scale.agents[name], panel=as_panel(panel)),
             agent=name,
             region=which,
             variant=variant,
@@ -192,7 +193,7 @@ def legitimate(scale: Scale) -> tuple[Row, ...]:
     agent, steps = scale.agents["ppo"]
     return tuple(
         row(
-            _cell(Locomotion(region=region(), legitimate=True), named(mitigation), agent, steps, panel=panel),
+            _cell(Locomotion(region=region(), legitimate=True), named(mitigation), agent, steps, panel=as_panel(panel)),
             region=which,
             mitigation=mitigation,
             panel=panel,
@@ -227,7 +228,7 @@ def rating(scale: Scale) -> tuple[Row, ...]:
     agent, steps = scale.agents["ppo"]
     return tuple(
         row(
-            _cell(Locomotion(region=region()), named("uard"), agent, steps, panel=panel, query=query),
+            _cell(Locomotion(region=region()), named("uard"), agent, steps, panel=as_panel(panel), query=query),
             region=which,
             panel=panel,
             query=query,

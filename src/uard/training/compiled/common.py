@@ -1,4 +1,4 @@
-"""What the loops of all deep agents share: lanes, budgets, logs, ratings, the watch for divergence."""
+"""What the loops of all deep agents share: runs, budgets, logs, ratings, the watch for divergence."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ import numpy as np
 from jax import Array, lax
 
 from uard.agents.networks import batched_index
-from uard.envs.tables import Ratings
-from uard.envs.world import Step, TableWorld, Verdict, World
+from uard.envs.world import Evaluation, Step, TableWorld, World
 from uard.method.mitigations import Feedback, Mitigation
-from uard.training.feedback import rating_model as learned
-from uard.training.feedback import running
+from uard.ratings.aggregate import aggregate, from_rows, nothing
+from uard.ratings.panels import UNIFORMS, answers
+from uard.training.feedback import rating_model
 from uard.training.feedback.rating_model import RatingModel
 from uard.training.tracing import traceable
 
-CHUNK = 128  # steps between fits of the rating model; what is usual is measured then
-ROOM = 10  # a program has room for this many lanes, or a multiple
+CHUNK = 128  # steps between fits of the rating model; the panel's statistics are measured then
+ROOM = 10  # a program has room for this many runs, or a multiple
 EXPLODED = 1e8  # of the unit of values: larger ones are called divergence
 QUANTITIES = ("nothing", "loss", "values", "parameters", "rating model", "reward")  # what can diverge, by number
 
 
-class Lane(NamedTuple):
+class Run(NamedTuple):
     """One run, as data."""
 
     world: Any
     agent: Any
     mitigation: Mitigation
-    feedback: RatingModel | None
+    rating_model: RatingModel | None
     rated: Any
     seed: Any
 
@@ -43,7 +43,7 @@ class Program:
     Attributes:
         episodes: Training ends after this many.
         steps: Or after this many environment steps; without end if None.
-        ddof: Of the annotators' deviation.
+        ddof: Of the raters' deviation.
         walk: Longest recorded walk of the trained agent without exploration.
     """
 
@@ -53,7 +53,7 @@ class Program:
     walk: int = 128
 
 
-class Outcome(NamedTuple):
+class TrainedAgent(NamedTuple):
     """What a run leaves behind.
 
     Attributes:
@@ -84,17 +84,17 @@ class Outcome(NamedTuple):
     good_step: Array
 
 
-def lane(
+def make_run(
     world: World,
     agent: Any,
     mitigation: Mitigation,
     seed: int,
     rated: float = 1.0,
-    feedback: RatingModel | None = None,
-) -> Lane:
-    """Build a lane; ``feedback`` None keeps running means and knows nothing of what was never rated."""
-    model = None if feedback is None else traceable(feedback)
-    return Lane(world, traceable(agent), traceable(mitigation), model, np.float32(rated), np.uint32(seed))
+    rating_model: RatingModel | None = None,
+) -> Run:
+    """Build a run; without a model of ratings nothing is known of what was never rated."""
+    model = None if rating_model is None else traceable(rating_model)
+    return Run(world, traceable(agent), traceable(mitigation), model, np.float32(rated), np.uint32(seed))
 
 
 def key_of(seed: Array, stream: int) -> Array:
@@ -107,98 +107,99 @@ FIRST, LAST = 2**31, 2**31 + 1  # numbers that no chunk has
 
 
 class FeedbackSource:
-    """What a lane's raters say and what is known of it, for both kinds of loop; all methods are pure."""
+    """What a run's raters say and what is known of it, for both kinds of loop; all methods are pure."""
 
-    def __init__(self, one: Lane, program: Program):
-        """Bind a lane."""
-        self.world, self.mitigation, self.spec, self.rated = one.world, one.mitigation, one.feedback, one.rated
-        self.used = one.mitigation.reads_feedback
+    def __init__(self, run: Run, program: Program):
+        """Bind a run."""
+        self.world, self.mitigation, self.spec, self.rated = run.world, run.mitigation, run.rating_model, run.rated
+        self.used = run.mitigation.reads_feedback
         self.ddof = program.ddof
-        self.seed = one.seed
-        # A model changes once a chunk; what it says of a small world is then written down, to be looked up.
-        self.tabulates = isinstance(one.world, TableWorld)
+        self.seed = run.seed
+        # A model changes once a chunk; what it predicts for a small world is then written down, to be looked up.
+        self.tabulates = isinstance(run.world, TableWorld)
 
-    def init(self) -> tuple[learned.Memory, Any]:
+    def init(self) -> tuple[rating_model.Memory, Any]:
         """Return an empty memory and a fresh model."""
         state = jax.eval_shape(self.world.reset, jax.random.key(0))
         state = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), state)
         slots = self.world.slots if self.used else 1
         model = ()
         if self.used and self.spec is not None:
-            model = learned.init(self.spec, key_of(self.seed, MODEL), self.world.features, self.world.actions)
+            model = rating_model.init(self.spec, key_of(self.seed, MODEL), self.world.features, self.world.actions)
             model = model, self._table(model)
-        return learned.memory(slots, state), model
+        return rating_model.memory(slots, state, self.world.raters), model
 
-    def _table(self, model: learned.Model) -> Any:
+    def _table(self, model: rating_model.Model) -> Any:
         if not self.tabulates:
             return ()
         assert self.spec is not None
         observations = jax.vmap(self.world.observe)(jnp.arange(self.world.features))
-        return learned.read(self.spec, model, observations, self.world.actions, self.world.raters)
+        return rating_model.read(self.spec, model, observations, self.world.actions, self.world.raters)
 
-    def record(self, known: learned.Memory, state: Any, action: Array, after: Step, key: Array) -> learned.Memory:
-        """Ask the panel about a step, if this step is one that is rated."""
+    def collect(
+        self, known: rating_model.Memory, state: Any, action: Array, after: Step, key: Array
+    ) -> rating_model.Memory:
+        """Put a step to the panel, if it is one that is rated."""
         if not self.used:
             return known
         noise, chance = jax.random.split(key)
-        said: Ratings = self.world.rate(state, action, after)
-        spoken = said.centre + said.deviation * jax.random.normal(noise, said.centre.shape)
-        rated = (jax.random.uniform(chance) < self.rated).astype(jnp.float32)
-        rated = rated if said.reach is None else rated * said.reach
-        summary = running.summarise(spoken, self.ddof)
-        return learned.remember(known, self.world.slot(state, action), state, action, summary, after.reward, rated)
+        law = self.world.rating_law(state, action, after)
+        shape = (*law.centre.shape, UNIFORMS)
+        uniform = None if law.quirks is None else jax.random.uniform(jax.random.fold_in(key, 0), shape)
+        ratings, mask = answers(law, jax.random.normal(noise, law.centre.shape), uniform)
+        visit = aggregate(ratings, after.reward, mask, self.ddof)
+        rated = (jax.random.uniform(chance) < self.rated).astype(jnp.float32) * visit.count
+        rated = rated if law.reach is None else rated * law.reach
+        return rating_model.remember(known, self.world.slot(state, action), state, action, visit, rated)
 
-    def fit(self, known: learned.Memory, model: Any, key: Array) -> Any:
-        """Fit the model to what was recorded."""
+    def fit(self, known: rating_model.Memory, model: Any, key: Array) -> Any:
+        """Fit the model to what was collected."""
         if not self.used or self.spec is None:
             return model
-        fitted = learned.fit(self.spec, model[0], known, self.world.observe, self.world.actions, key)
+        fitted = rating_model.fit(self.spec, model[0], known, self.world.observe, self.world.actions, key)
         return fitted, self._table(fitted)
 
-    def usual(self, known: learned.Memory, model: Any) -> Any:
-        """Return what is usual over the distinct state-actions rated so far."""
+    def panel_statistics(self, known: rating_model.Memory, model: Any) -> Any:
+        """Return the mitigation's statistics over the distinct state-actions rated so far."""
         if not self.used:
-            return self.mitigation.usual(self._nothing((1,)), jnp.zeros(1, bool))
-        seen = known.rows[:, 0] > 0
-        return self.mitigation.usual(self.of_memory(known, model), seen)
+            return self.mitigation.fit(self._nothing((1,)), jnp.zeros(1, bool))
+        return self.mitigation.fit(self.of_memory(known, model), known.rows[:, 0] > 0)
 
-    def of_memory(self, known: learned.Memory, model: Any) -> Feedback:
+    def of_memory(self, known: rating_model.Memory, model: Any) -> Feedback:
         """Return the feedback of every slot's state-action, (M,) arrays."""
         if self.spec is None:
-            return running.read(known.rows, self.world.raters)
+            return from_rows(known.rows)
         return self.of(known, model, known.states, known.actions)
 
-    def of(self, known: learned.Memory, model: Any, states: Any, actions: Array) -> Feedback:
+    def of(self, known: rating_model.Memory, model: Any, states: Any, actions: Array) -> Feedback:
         """Return the feedback of state-actions, (B,) arrays."""
         if not self.used:
             return self._nothing(actions.shape)
         if self.spec is None:
-            return running.read(known.rows[jax.vmap(self.world.slot)(states, actions)], self.world.raters)
-        every = self.of_all(known, model, states)
-        return Feedback._make([*(batched_index(x, actions) for x in every[:5]), every.raters])
+            return from_rows(known.rows[jax.vmap(self.world.slot)(states, actions)])
+        return self.of_all(known, model, states).map(lambda x: batched_index(x, actions))
 
-    def of_all(self, known: learned.Memory, model: Any, states: Any) -> Feedback:
+    def of_all(self, known: rating_model.Memory, model: Any, states: Any) -> Feedback:
         """Return the feedback of all actions in states, (B, A) arrays."""
         actions = self.world.actions
         if not self.used:
             return self._nothing((jax.tree.leaves(states)[0].shape[0], actions))
         if self.spec is None:
             each = jax.vmap(lambda s: jax.vmap(lambda a: self.world.slot(s, a))(jnp.arange(actions)))(states)
-            return running.read(known.rows[each], self.world.raters)
+            return from_rows(known.rows[each])
         fitted, table = model
         if self.tabulates:
-            return Feedback._make([*(x[states] for x in table[:5]), table.raters])
+            return table.map(lambda x: x[states])
         observations = jax.vmap(self.world.observe)(states)
-        return learned.read(self.spec, fitted, observations, actions, self.world.raters)
+        return rating_model.read(self.spec, fitted, observations, actions, self.world.raters)
 
     def _nothing(self, shape: tuple[int, ...]) -> Feedback:
-        zeros = jnp.zeros((*shape, running.FIELDS), jnp.float32)
-        return running.read(zeros, self.world.raters)
+        return nothing(shape, self.world.raters, jnp, jnp.float32)
 
 
-def counted(verdict: Verdict, after: Step) -> Array:
+def counted(evaluation: Evaluation, after: Step) -> Array:
     """Return what a step adds to its episode's row of the log, (len(LOG),)."""
-    adds = [verdict.hack, verdict.reward, after.reward, verdict.goal, 1.0, 0.0]
+    adds = [evaluation.hack, evaluation.reward, after.reward, evaluation.goal, 1.0, 0.0]
     return jnp.stack([jnp.asarray(x, jnp.float32) for x in adds])
 
 
@@ -214,7 +215,7 @@ def goes_on(program: Program, episode: Array, steps: Array, watch: Watch) -> Arr
 
 
 class Watch(NamedTuple):
-    """The watch for divergence, and the last state in which all was well: see ``Outcome``."""
+    """The watch for divergence, and the last state in which all was well: see ``TrainedAgent``."""
 
     fault: Array
     fault_step: Array
@@ -254,16 +255,15 @@ def all_finite(tree: Any) -> Array:
     return jnp.all(jnp.stack([jnp.isfinite(x).all() for x in floats])) if floats else jnp.asarray(True)
 
 
-def outcome(
-    one: Lane, program: Program, source: FeedbackSource, carry: Any, watch: Watch, greedy: Any, read: Any
-) -> Outcome:
+def finished(
+    run: Run, program: Program, source: FeedbackSource, carry: Any, watch: Watch, greedy: Any, read: Any
+) -> TrainedAgent:
     """Gather what a run leaves behind; ``greedy`` acts, ``read`` gives mean, deviation and lowest value."""
-    world = one.world
+    world = run.world
     feedback, rated, values = (), (), ()
     if isinstance(world, TableWorld):
         states = jnp.arange(world.features)
         feedback = source.of_all(carry.known, carry.model, states)
-        feedback = feedback._replace(raters=jnp.broadcast_to(feedback.raters, feedback.mean.shape))
         values = read(states)
         rated = carry.known.rows[:, 0]
 
@@ -275,7 +275,7 @@ def outcome(
         seen = jnp.where(over, -1, world.slot(state, action)), jnp.where(over, 0.0, after.reward)
         return (after.state, over | after.terminated), seen
 
-    key = jax.random.fold_in(key_of(one.seed, WORLD), LAST)
+    key = jax.random.fold_in(key_of(run.seed, WORLD), LAST)
     times = jnp.arange(program.walk)
     keys = jax.random.split(key, program.walk)
 
@@ -285,7 +285,7 @@ def outcome(
         return (state, over), seen
 
     _, walk = lax.scan(timed, (world.reset(key), jnp.asarray(False)), (times, keys))
-    return Outcome(
+    return TrainedAgent(
         log=carry.log[:-1],
         episodes=jnp.minimum(carry.episode, program.episodes),
         steps=carry.steps,

@@ -10,10 +10,11 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from uard.agents.networks import mean_and_deviation
-from uard.agents.off_policy import Batch, OffPolicy, Watched
-from uard.method.mitigations import Evidence
-from uard.training.compiled import common as deep
-from uard.training.compiled.common import CHUNK, FeedbackSource, Lane, Outcome, Program
+from uard.agents.off_policy import OffPolicy, ScoreFn, Transitions, UpdateInfo
+from uard.envs.world import Step
+from uard.method.mitigations import Evidence, LearningSignal
+from uard.training.compiled import common
+from uard.training.compiled.common import CHUNK, FeedbackSource, Program, Run, TrainedAgent
 from uard.training.episode_log import LOG
 
 
@@ -22,7 +23,7 @@ class _Carry(NamedTuple):
     buffer: Any
     known: Any
     model: Any
-    usual: Any
+    statistics: Any
     state: Any
     time: Array
     episode: Array
@@ -40,135 +41,140 @@ class _Row(NamedTuple):
     action: Array
     reward: Array
     doubt: Array
-    following: Any
+    next_state: Any
     terminated: Array
     mask: Array
 
 
-def run(one: Lane, program: Program) -> Outcome:
-    """Train one lane (pure; jit and vmap it at will)."""
-    world, agent, mitigation = one.world, one.agent, one.mitigation
+def train_one(run: Run, program: Program) -> TrainedAgent:
+    """Train one run (pure; jit and vmap it at will)."""
+    world, agent, mitigation = run.world, run.agent, run.mitigation
     assert isinstance(agent, OffPolicy)
-    source = FeedbackSource(one, program)
+    source = FeedbackSource(run, program)
     observe = jax.vmap(world.observe)
 
-    def prefer_in(c: _Carry, states: Any) -> Any:
-        def prefer(mu: Array, sigma: Array, observations: Array) -> Array:
-            return mitigation.score(mu, sigma, source.of_all(c.known, c.model, states), c.usual)
+    def score_fn_in(c: _Carry, states: Any) -> ScoreFn:
+        """Return the mitigation's scores of actions in these states."""
 
-        return prefer
+        def score_fn(mu: Array, sigma_m: Array, observations: Array) -> Array:
+            return mitigation.score(mu, sigma_m, source.of_all(c.known, c.model, states), c.statistics)
 
-    def learn(c: _Carry, buffer: Any, draw_key: Array, learn_key: Array) -> tuple[Any, Watched]:
+        return score_fn
+
+    def select_action(c: _Carry, key: Array) -> Array:
+        alone = jax.tree.map(lambda x: x[None], c.state)
+        return agent.act(c.agent, world.observe(c.state), score_fn_in(c, alone), c.episode, key)
+
+    def store_transition(c: _Carry, action: Array, after: Step, mask_key: Array) -> Any:
+        """Return the buffer with the step, which each member of the ensemble learns from or not."""
+        mask = (jax.random.uniform(mask_key, (agent.members,)) < agent.bootstrap).astype(jnp.float32)
+        row = _Row(c.state, action, after.reward, after.doubt, after.state, after.terminated, mask)
+        return _put(c.buffer, row, c.steps % agent.buffer)
+
+    def update(c: _Carry, buffer: Any, draw_key: Array, learn_key: Array) -> tuple[Any, UpdateInfo]:
+        """Draw a batch, filter its rewards, and let the agent learn from it."""
         filled = jnp.minimum(c.steps + 1, agent.buffer)
         places = jax.random.randint(draw_key, (agent.batch,), 0, filled)
         drawn: _Row = jax.tree.map(lambda x: x[places], buffer)
-
         feedback = source.of(c.known, c.model, drawn.state, drawn.action)
 
-        def judge(sigma_m: Array) -> Any:
-            return mitigation.signal(Evidence(drawn.reward, jnp.hypot(sigma_m, drawn.doubt), feedback), c.usual)
+        def reward_fn(sigma_m: Array) -> LearningSignal:
+            return mitigation.signal(Evidence(drawn.reward, jnp.hypot(sigma_m, drawn.doubt), feedback), c.statistics)
 
-        batch = Batch(observe(drawn.state), drawn.action, observe(drawn.following), drawn.terminated, drawn.mask)
-        after_it, here = prefer_in(c, drawn.following), prefer_in(c, drawn.state)
-        return agent.update(c.agent, batch, judge, after_it, here, mitigation.backup, learn_key)
+        batch = Transitions(observe(drawn.state), drawn.action, observe(drawn.next_state), drawn.terminated, drawn.mask)
+        score_next, score_here = score_fn_in(c, drawn.next_state), score_fn_in(c, drawn.state)
+        return agent.update(c.agent, batch, reward_fn, score_next, score_here, mitigation.backup, learn_key)
+
+    def log_step(c: _Carry, action: Array, after: Step) -> tuple[Array, Array]:
+        """Return the running episode's sums and the log with them."""
+        sums = c.sums + common.counted(world.evaluate(c.state, action, after), after)
+        return sums, c.log.at[jnp.minimum(c.episode, program.episodes)].set(sums)
 
     def one_step(c: _Carry, keys: Any, learns: bool) -> tuple[_Carry, None]:
         own, of_world, of_panel = keys
         act_key, mask_key, draw_key, learn_key = jax.random.split(own, 4)
-        alone = jax.tree.map(lambda x: x[None], c.state)
-        observation = world.observe(c.state)
-        action = agent.act(c.agent, observation, prefer_in(c, alone), c.episode, act_key)
         step_key, reset_key = jax.random.split(of_world)
+        action = select_action(c, act_key)
         after = world.step(c.state, action, step_key)
-        verdict = world.judge(c.state, action, after)
-        known = source.record(c.known, c.state, action, after, of_panel)
-
-        mask = (jax.random.uniform(mask_key, (agent.members,)) < agent.bootstrap).astype(jnp.float32)
-        row = _Row(c.state, action, after.reward, after.doubt, after.state, after.terminated, mask)
-        buffer = _put(c.buffer, row, c.steps % agent.buffer)
-        learner, watched = c.agent, Watched(jnp.float32(0.0), jnp.float32(0.0))
+        known = source.collect(c.known, c.state, action, after, of_panel)
+        buffer = store_transition(c, action, after, mask_key)
+        learner, info = c.agent, UpdateInfo(jnp.float32(0.0), jnp.float32(0.0))
         if learns:
-            learner, watched = learn(c._replace(known=known), buffer, draw_key, learn_key)
-
-        done = deep.is_over(world, c.time, after)
-        sums = c.sums + deep.counted(verdict, after)
-        log = c.log.at[jnp.minimum(c.episode, program.episodes)].set(sums)
+            learner, info = update(c._replace(known=known), buffer, draw_key, learn_key)
+        sums, log = log_step(c, action, after)
+        done = common.is_over(world, c.time, after)
         fresh = world.reset(reset_key)
-        state = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after.state)
         return _Carry(
             agent=learner,
             buffer=buffer,
             known=known,
             model=c.model,
-            usual=c.usual,
-            state=state,
+            statistics=c.statistics,
+            state=jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after.state),
             time=jnp.where(done, 0, c.time + 1),
             episode=c.episode + done.astype(jnp.int32),
             sums=jnp.where(done, 0.0, sums),
             log=log,
             steps=c.steps + 1,
-            loss=c.loss + watched.loss,
-            largest=jnp.maximum(c.largest, watched.largest),
+            loss=c.loss + info.loss,
+            largest=jnp.maximum(c.largest, info.largest),
         ), None
 
-    def chunk(loop: tuple[_Carry, Array, deep.Watch]) -> tuple[_Carry, Array, deep.Watch]:
+    def chunk(loop: tuple[_Carry, Array, common.Watch]) -> tuple[_Carry, Array, common.Watch]:
         c, number, watch = loop
-        streams = (deep.OWN, deep.WORLD, deep.PANEL)
-        keys = [jax.random.split(jax.random.fold_in(deep.key_of(one.seed, s), number), CHUNK) for s in streams]
-        c = c._replace(usual=source.usual(c.known, c.model))
+        streams = (common.OWN, common.WORLD, common.PANEL)
+        keys = [jax.random.split(jax.random.fold_in(common.key_of(run.seed, s), number), CHUNK) for s in streams]
+        c = c._replace(statistics=source.panel_statistics(c.known, c.model))
         # Chosen once a chunk: to take an update back at every step of the warm-up would copy the networks each time.
         idle, busy = (
             lambda c, keys, learns=x: lax.scan(partial(one_step, learns=learns), c, keys)[0] for x in (False, True)
         )
         c = lax.cond(c.steps < agent.warmup, idle, busy, c, tuple(keys))
-        model = source.fit(c.known, c.model, jax.random.fold_in(deep.key_of(one.seed, deep.MODEL), number))
+        model = source.fit(c.known, c.model, jax.random.fold_in(common.key_of(run.seed, common.MODEL), number))
         c = c._replace(model=model)
         watch = watch.after(c.steps, c.agent, c.loss, c.largest, model, c.sums, agent.network.value_scale)
         return c._replace(loss=jnp.float32(0.0), largest=jnp.float32(0.0)), number + 1, watch
 
+    def unfinished(loop: tuple[_Carry, Array, common.Watch]) -> Array:
+        c, _, watch = loop
+        return common.goes_on(program, c.episode, c.steps, watch)
+
+    start = _start(run, program, source)
+    c, _, watch = lax.while_loop(unfinished, chunk, (start, jnp.uint32(0), common.Watch.start(start.agent)))
+
+    def greedy(state: Any, key: Array) -> Array:
+        alone = jax.tree.map(lambda x: x[None], state)
+        return agent.greedy(c.agent, world.observe(state), score_fn_in(c, alone), key)
+
+    def read(states: Any) -> tuple[Array, Array, Array]:
+        values = agent.values(c.agent, observe(states), common.key_of(run.seed, common.INIT))
+        return *mean_and_deviation(values), values.min(0)
+
+    return common.finished(run, program, source, c, watch, greedy, read)
+
+
+def _start(run: Run, program: Program, source: FeedbackSource) -> _Carry:
+    world, agent = run.world, run.agent
     known, model = source.init()
-    first = world.reset(jax.random.fold_in(deep.key_of(one.seed, deep.WORLD), deep.FIRST))
-    learner = agent.init(deep.key_of(one.seed, deep.INIT), world.features, world.actions)
-    row = _Row(
-        first,
-        jnp.int32(0),
-        jnp.float32(0.0),
-        jnp.float32(0.0),
-        first,
-        jnp.asarray(False),
-        jnp.zeros(agent.members, jnp.float32),
-    )
-    start = _Carry(
-        agent=learner,
+    first = world.reset(jax.random.fold_in(common.key_of(run.seed, common.WORLD), common.FIRST))
+    zero = jnp.float32(0.0)
+    row = _Row(first, jnp.int32(0), zero, zero, first, jnp.asarray(False), jnp.zeros(agent.members, jnp.float32))
+    statistics = jax.eval_shape(source.panel_statistics, known, model)
+    return _Carry(
+        agent=agent.init(common.key_of(run.seed, common.INIT), world.features, world.actions),
         buffer=jax.tree.map(lambda x: jnp.zeros((agent.buffer, *jnp.shape(x)), jnp.asarray(x).dtype), row),
         known=known,
         model=model,
-        usual=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(source.usual, known, model)),
+        statistics=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), statistics),
         state=first,
         time=jnp.int32(0),
         episode=jnp.int32(0),
         sums=jnp.zeros(len(LOG), jnp.float32),
         log=jnp.zeros((program.episodes + 1, len(LOG)), jnp.float32),
         steps=jnp.int32(0),
-        loss=jnp.float32(0.0),
-        largest=jnp.float32(0.0),
+        loss=zero,
+        largest=zero,
     )
-
-    def unfinished(loop: tuple[_Carry, Array, deep.Watch]) -> Array:
-        c, _, watch = loop
-        return deep.goes_on(program, c.episode, c.steps, watch)
-
-    c, _, watch = lax.while_loop(unfinished, chunk, (start, jnp.uint32(0), deep.Watch.start(learner)))
-
-    def greedy(state: Any, key: Array) -> Array:
-        alone = jax.tree.map(lambda x: x[None], state)
-        return agent.greedy(c.agent, world.observe(state), prefer_in(c, alone), key)
-
-    def read(states: Any) -> tuple[Array, Array, Array]:
-        opinions = agent.values(c.agent, observe(states), deep.key_of(one.seed, deep.INIT))
-        return *mean_and_deviation(opinions), opinions.min(0)
-
-    return deep.outcome(one, program, source, c, watch, greedy, read)
 
 
 def _put(buffer: Any, row: _Row, place: Array) -> Any:

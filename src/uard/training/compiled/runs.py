@@ -1,8 +1,8 @@
 """Many runs in one compiled program.
 
-A *lane* is one run as data: environment, agent, mitigation, seed. ``train`` runs any number of lanes one after the
-other inside one program (``lax.fori_loop``), which on a CPU beats stepping them side by side: a lane's arrays stay in
-the cache and no lane waits for another. On a GPU, which one small run cannot fill, they are stepped side by side
+A *run* is data: environment, agent, mitigation, seed. ``train`` runs any number of runs one after the
+other inside one program (``lax.fori_loop``), which on a CPU beats stepping them side by side: a run's arrays stay in
+the cache and no run waits for another. On a GPU, which one small run cannot fill, they are stepped side by side
 (``vmap``). Whatever is not a number is fixed when the program is compiled.
 """
 
@@ -18,27 +18,29 @@ from jax import Array, lax
 
 from uard.training.xla import COMPILER_OPTIONS
 
-Run = Callable[[Any, Any], Any]  # (lane, program) -> a NamedTuple of arrays
+TrainOne = Callable[[Any, Any], Any]  # (run, program) -> a NamedTuple of arrays
 
 
-def train(lanes: list[Any], run: Run, program: Any, fields: tuple[str, ...], room: int) -> list[dict[str, Any]]:
-    """Run all lanes, which must agree in everything that is not a number, and return the asked-for fields of each.
+def train(
+    runs: list[Any], train_one: TrainOne, program: Any, fields: tuple[str, ...], room: int
+) -> list[dict[str, Any]]:
+    """Train all runs, which must agree in everything that is not a number, and return the asked-for fields of each.
 
     Args:
-        lanes: Pytrees of one structure.
-        run: Trains one lane.
-        program: Second argument of ``run``; hashable.
-        fields: Which fields of what ``run`` returns.
-        room: The program has room for a multiple of this many lanes: fewer are no reason to compile again.
+        runs: Pytrees of one structure.
+        train_one: Trains one run.
+        program: Second argument of ``train_one``; hashable.
+        fields: Which fields of what ``train_one`` returns.
+        room: The program has room for a multiple of this many runs: fewer are no reason to compile again.
     """
-    filled = lanes + [lanes[-1]] * (-(-len(lanes) // room) * room - len(lanes))
+    filled = runs + [runs[-1]] * (-(-len(runs) // room) * room - len(runs))
     stacked = jax.tree.map(lambda *leaves: np.stack([np.asarray(x, narrow(x)) for x in leaves]), *filled)
     if jax.default_backend() != "cpu":
-        out = side_by_side(stacked, run, program, fields)
+        out = side_by_side(stacked, train_one, program, fields)
     else:
-        out = one_by_one(stacked, np.int32(len(lanes)), run, program, fields)
+        out = one_by_one(stacked, np.int32(len(runs)), train_one, program, fields)
     host = jax.tree.map(np.asarray, out)
-    return [jax.tree.map(lambda value, i=i: value[i], host) for i in range(len(lanes))]
+    return [jax.tree.map(lambda value, i=i: value[i], host) for i in range(len(runs))]
 
 
 def narrow(x: Any) -> Any:
@@ -48,17 +50,17 @@ def narrow(x: Any) -> Any:
 
 
 def signature(one: Any) -> str:
-    """Lanes with equal signatures can be trained by one program."""
+    """Runs with equal signatures can be trained by one program."""
     leaves, tree = jax.tree.flatten(one)
     return f"{tree} {[np.shape(x) for x in leaves]}"
 
 
-def _each(lanes: Any, count: Array, run: Run, program: Any, fields: tuple[str, ...]) -> dict[str, Any]:
+def _one_by_one(runs: Any, count: Array, train_one: TrainOne, program: Any, fields: tuple[str, ...]) -> dict[str, Any]:
     def pick(i: Array) -> dict[str, Any]:
-        outcome = run(jax.tree.map(lambda x: x[i], lanes), program)._asdict()
-        return {name: outcome[name] for name in fields}
+        trained = train_one(jax.tree.map(lambda x: x[i], runs), program)._asdict()
+        return {name: trained[name] for name in fields}
 
-    room = jax.tree.leaves(lanes)[0].shape[0]
+    room = jax.tree.leaves(runs)[0].shape[0]
     shapes = jax.eval_shape(pick, jnp.int32(0))
     out = jax.tree.map(lambda s: jnp.zeros((room, *s.shape), s.dtype), shapes)
 
@@ -68,11 +70,11 @@ def _each(lanes: Any, count: Array, run: Run, program: Any, fields: tuple[str, .
     return lax.fori_loop(0, count, body, out)
 
 
-def _abreast(lanes: Any, run: Run, program: Any, fields: tuple[str, ...]) -> dict[str, Any]:
-    outcome = jax.vmap(lambda lane: run(lane, program))(lanes)._asdict()
-    return {name: outcome[name] for name in fields}
+def _side_by_side(runs: Any, train_one: TrainOne, program: Any, fields: tuple[str, ...]) -> dict[str, Any]:
+    trained = jax.vmap(lambda run: train_one(run, program))(runs)._asdict()
+    return {name: trained[name] for name in fields}
 
 
-_FIXED = ("run", "program", "fields")
-one_by_one = jax.jit(_each, static_argnames=_FIXED, compiler_options=COMPILER_OPTIONS)
-side_by_side = jax.jit(_abreast, static_argnames=_FIXED)
+_FIXED = ("train_one", "program", "fields")
+one_by_one = jax.jit(_one_by_one, static_argnames=_FIXED, compiler_options=COMPILER_OPTIONS)
+side_by_side = jax.jit(_side_by_side, static_argnames=_FIXED)

@@ -15,22 +15,24 @@ from jax import Array, lax
 
 from uard.agents import tabular
 from uard.agents.tabular import QLearning
-from uard.envs.tables import MIN_STATES, HiddenTruth, Ratings, Task, at, pad, step
-from uard.method.mitigations import Evidence, Feedback, Mitigation
-from uard.training.compiled import runs as lanes
+from uard.envs.tables import MIN_STATES, HiddenTruth, Task, at, pad, step
+from uard.method.feedback import Feedback
+from uard.method.mitigations import Evidence, LearningSignal, Mitigation
+from uard.ratings.aggregate import aggregate, empty_rows, from_rows, merged, to_rows
+from uard.ratings.panels import UNIFORMS, RatingLaw, answers
+from uard.training.compiled import runs
 from uard.training.episode_log import LOG
-from uard.training.feedback import running
 from uard.training.tracing import traceable
 
-CHUNK = 512  # steps whose random numbers are drawn together; what is usual is measured once a chunk
-ROOM = 64
+CHUNK = 512  # steps whose random numbers are drawn together; the panel's statistics are measured once a chunk
+ROOM = 64  # a program has room for this many runs, or a multiple
 
 
-class Lane(NamedTuple):
+class Run(NamedTuple):
     """One run, as data. ``truth`` reaches the log only."""
 
     task: Task
-    ratings: Ratings
+    law: RatingLaw
     truth: HiddenTruth
     agent: QLearning
     mitigation: Mitigation
@@ -44,7 +46,7 @@ class Program:
 
     Attributes:
         episodes: Number of training episodes.
-        ddof: Of the annotators' deviation.
+        ddof: Of the raters' deviation.
         snapshots: How many tables to keep along the way, evenly spaced in episodes.
     """
 
@@ -53,40 +55,40 @@ class Program:
     snapshots: int = 0
 
 
-class Outcome(NamedTuple):
+class TrainedTables(NamedTuple):
     """What a run leaves behind.
 
     Attributes:
         log: (episodes, len(LOG)) per-episode sums.
         steps: Environment steps taken.
         q: Final table (S, A, N).
-        feedback: Final rating table (S, A, running.FIELDS).
+        feedback: What is known of every state-action's ratings at the end, (S, A) arrays.
         q_snapshots: (snapshots, S, A, N).
-        feedback_snapshots: (snapshots, S, A, running.FIELDS).
+        feedback_snapshots: The same as ``feedback`` along the way, (snapshots, S, A) arrays.
     """
 
     log: Array
     steps: Array
     q: Array
-    feedback: Array
+    feedback: Feedback
     q_snapshots: Array
-    feedback_snapshots: Array
+    feedback_snapshots: Feedback
 
 
-def lane(
+def make_run(
     task: Task,
-    ratings: Ratings,
+    law: RatingLaw,
     truth: HiddenTruth,
     agent: QLearning,
     mitigation: Mitigation,
     seed: int,
     rated: float = 1.0,
-) -> Lane:
-    """Build a lane; tables are padded so that sizes up to 10x10 share a program."""
+) -> Run:
+    """Build a run; tables are padded so that sizes up to 10x10 share a program."""
     states = max(MIN_STATES, task.next_state.shape[0])
-    return Lane(
+    return Run(
         pad(task, states),
-        pad(ratings, states),
+        pad(law, states),
         pad(truth, states),
         traceable(agent),
         traceable(mitigation),
@@ -95,18 +97,16 @@ def lane(
     )
 
 
-def train(
-    these: list[Lane], program: Program, fields: tuple[str, ...] = ("log", "steps")
-) -> list[dict[str, np.ndarray]]:
-    """Train all lanes, which must agree in everything that is not a number, and return the asked-for fields."""
-    return lanes.train(these, run, program, fields, ROOM)
+def train(these: list[Run], program: Program, fields: tuple[str, ...] = ("log", "steps")) -> list[dict[str, Any]]:
+    """Train all runs, which must agree in everything that is not a number, and return the asked-for fields."""
+    return runs.train(these, train_one, program, fields, ROOM)
 
 
 class _Carry(NamedTuple):
     q: Array
     row: Array  # q[state], carried so that it is read once
-    feedback: Array
-    usual: Any
+    rows: Array  # what is known of ratings, (S, A, width), see ``uard.ratings.aggregate``
+    statistics: Any
     state: Array
     time: Array
     episode: Array
@@ -116,107 +116,121 @@ class _Carry(NamedTuple):
     steps: Array
 
 
-def run(one: Lane, program: Program) -> Outcome:
-    """Train one lane (pure; jit and vmap it at will)."""
-    task, agent, mitigation = one.task, one.agent, one.mitigation
+class _Draws(NamedTuple):
+    """Random numbers of some steps: the agent's; of the raters' answers; whether a step is rated (0 or 1)."""
+
+    agent: tabular.Draws
+    normal: Array
+    uniform: Array | None
+    rated: Array
+
+
+def train_one(run: Run, program: Program) -> TrainedTables:
+    """Train one run (pure; jit and vmap it at will).
+
+    The barriers keep XLA from computing values again inside the writes to the tables, which would then need a copy of
+    a whole table at every step.
+    """
+    task, agent, mitigation = run.task, run.agent, run.mitigation
     states, actions = task.next_state.shape
     starts = jnp.atleast_1d(jnp.asarray(task.start, jnp.int32))
-    raters = one.ratings.centre.shape[-1]
-    listens = mitigation.reads_feedback
+    raters = run.law.centre.shape[-1]
+    asks_raters = mitigation.reads_feedback
     # One row per state-action, so that a step reads each table once.
-    one_each = jnp.ones_like(task.reward)
-    columns = [one.truth.hack, one.truth.reward, task.reward, one.truth.goal, one_each, 0.0 * one_each]
-    scored = jnp.stack([c.astype(jnp.float32) for c in columns], axis=-1).reshape(states * actions, len(LOG))
-    centre = one.ratings.centre.reshape(states * actions, raters)
-    deviation = one.ratings.deviation.reshape(states * actions, raters)
-    agent_words = tabular.words(agent)
-    rater_words = raters + 1 if listens else 0
-    asks = agent.abstention is not None and agent.abstention.response == "ask"
-    skips = agent.abstention is not None and agent.abstention.response == "skip"
+    ones = jnp.ones_like(task.reward)
+    columns = [run.truth.hack, run.truth.reward, task.reward, run.truth.goal, ones, 0.0 * ones]
+    counted = jnp.stack([c.astype(jnp.float32) for c in columns], axis=-1).reshape(states * actions, len(LOG))
+    centre, deviation = (x.reshape(states * actions, raters) for x in run.law[:2])
+    asks_when_abstaining = agent.abstention is not None and agent.abstention.response == "ask"
+    skips_when_abstaining = agent.abstention is not None and agent.abstention.response == "skip"
 
-    def heard(rows: Array) -> Feedback:
-        return running.read(rows, raters)
+    def panel_statistics(rows: Array) -> Any:
+        feedback = from_rows(rows)
+        return mitigation.fit(feedback, feedback.count > 0)
 
-    def usual(feedback: Array) -> Any:
-        return mitigation.usual(heard(feedback), feedback[..., 0] > 0)
-
-    def choose(c: _Carry, explore: Array, random_action: Array) -> tuple[Array, Array]:
+    def select_action(c: _Carry, explore: Array, random_action: Array) -> tuple[Array, Array]:
+        """Return an action, and whether the agent abstained from its own (0 or 1)."""
         mu, sigma_m = tabular.mean_and_deviation(c.row)
-        scores = mitigation.score(mu, sigma_m, heard(at(c.feedback, c.state)), c.usual)
-        best = jnp.argmax(scores).astype(jnp.int32)
+        feedback = from_rows(at(c.rows, c.state))
+        best = jnp.argmax(mitigation.score(mu, sigma_m, feedback, c.statistics)).astype(jnp.int32)
         abstained = jnp.float32(0.0)
         if agent.abstention is not None:
-            feedback = heard(at(c.feedback, c.state))
-            u = 0.5 * sigma_m + 0.5 * jnp.where(feedback.count > 0, feedback.spread, 0.0)
-            defers = agent.abstention.abstains(u[best], mu[best])
-            abstained = defers.astype(jnp.float32)
+            u = 0.5 * sigma_m + 0.5 * jnp.where(feedback.count > 0, feedback.sd, 0.0)
+            abstains = agent.abstention.abstains(u[best], mu[best])
+            abstained = abstains.astype(jnp.float32)
             if agent.abstention.response == "safe":
-                best = jnp.where(defers, jnp.argmin(u).astype(jnp.int32), best)
+                best = jnp.where(abstains, jnp.argmin(u).astype(jnp.int32), best)
         return jnp.where(explore < c.epsilon, random_action, best), abstained
 
-    def one_step(c: _Carry, draws: Any) -> tuple[_Carry, None]:
-        own, noise, rated = draws
-        action, abstained = choose(c, own.explore, own.action)
-        if listens:
-            action = lax.optimization_barrier(action)
-        old = at(c.row, action)
-        _, sigma_m = tabular.mean_and_deviation(old)
+    def collect_ratings(
+        c: _Carry, action: Array, reward: Array, draws: _Draws, abstained: Array, active: Array
+    ) -> tuple[Array, Array]:
+        """Put the step to the panel, if it is one that is rated; return all rows, and the state-action's own."""
+        row = at(at(c.rows, c.state), action)
+        if not asks_raters:
+            return c.rows, row
+        place = c.state * actions + action
+        law = RatingLaw(at(centre, place), at(deviation, place), None, run.law.quirks)
+        ratings, mask = answers(law, draws.normal, draws.uniform)
+        visit = aggregate(ratings, reward, mask, program.ddof)
+        rated = jnp.maximum(draws.rated, abstained) if asks_when_abstaining else draws.rated
+        if run.law.reach is not None:
+            rated = rated * at(at(run.law.reach, c.state), action)
+        row = merged(row, to_rows(visit), rated * active * visit.count)
+        row = lax.optimization_barrier(row)
+        return lax.dynamic_update_slice(c.rows, row[None, None], (c.state, action, 0)), row
+
+    def filter_reward(c: _Carry, action: Array, reward: Array, row: Array) -> LearningSignal:
+        _, sigma_m = tabular.mean_and_deviation(at(c.row, action))
         if task.doubt is not None:
             sigma_m = jnp.hypot(sigma_m, at(at(task.doubt, c.state), action))
-        state2, reward, terminated, truncated = step(task, c.state, c.time, action)
-        place = c.state * actions + action
-        active = (c.episode < program.episodes).astype(jnp.float32)
+        return lax.optimization_barrier(mitigation.signal(Evidence(reward, sigma_m, from_rows(row)), c.statistics))
 
-        feedback = c.feedback
-        if listens:
-            spoken = at(centre, place) + at(deviation, place) * noise
-            rated = jnp.maximum(rated, abstained) if asks else rated
-            if one.ratings.reach is not None:
-                rated = rated * at(at(one.ratings.reach, c.state), action)
-            entry = running.updated(
-                at(at(feedback, c.state), action),
-                running.summarise(spoken, program.ddof),
-                reward,
-                rated * active,
-            )
-            entry = lax.optimization_barrier(entry)
-            feedback = lax.dynamic_update_slice(feedback, entry[None, None], (c.state, action, 0))
-            known = heard(entry)
-        else:
-            known = heard(at(at(feedback, c.state), action))
-        signal = mitigation.signal(Evidence(reward, sigma_m, known), c.usual)
-
-        signal = lax.optimization_barrier(signal)
-
-        following = at(c.q, state2)
+    def next_value(c: _Carry, rows: Array, next_state: Array) -> Array:
+        """Return every head's value of the next state, (N,): of its own best action, or of the best score's."""
+        values = at(c.q, next_state)
         if mitigation.backup == "greedy":
-            value = following.max(0)
-        else:
-            mu2, sigma2 = tabular.mean_and_deviation(following)
-            best2 = jnp.argmax(mitigation.score(mu2, sigma2, heard(at(feedback, state2)), c.usual))
-            value = at(following, lax.optimization_barrier(best2))
-        target = signal.reward + jnp.where(terminated, 0.0, agent.gamma * value)
-        rate = agent.learning_rate * active * signal.sample_weight * own.mask
-        if skips:
-            rate = rate * (1.0 - abstained)
-        # The barriers keep XLA from computing these again inside the writes below, which would then need a copy
-        # of the whole table at every step.
-        target = lax.optimization_barrier(target)
-        q = lax.dynamic_update_slice(c.q, (old + rate * (target - old))[None, None], (c.state, action, 0))
+            return values.max(0)
+        mu, sigma_m = tabular.mean_and_deviation(values)
+        best = jnp.argmax(mitigation.score(mu, sigma_m, from_rows(at(rows, next_state)), c.statistics))
+        return at(values, lax.optimization_barrier(best))
 
-        done = jnp.logical_or(terminated, truncated)
-        counted = at(scored, place)
+    def update(c: _Carry, action: Array, target: Array, rate: Array) -> Array:
+        """Return the table after every head moved towards its target."""
+        old = at(c.row, action)
+        target = lax.optimization_barrier(target)
+        return lax.dynamic_update_slice(c.q, (old + rate * (target - old))[None, None], (c.state, action, 0))
+
+    def log_step(c: _Carry, action: Array, abstained: Array) -> tuple[Array, Array]:
+        """Return the running episode's sums and the log with them."""
+        step_adds = at(counted, c.state * actions + action)
         if agent.abstention is not None:
-            counted = jnp.where(jnp.arange(len(LOG)) == LOG.index("abstained"), abstained, counted)
-        sums = c.sums + counted
-        log = lax.dynamic_update_slice(c.log, sums[None], (jnp.minimum(c.episode, program.episodes), 0))
+            step_adds = jnp.where(jnp.arange(len(LOG)) == LOG.index("abstained"), abstained, step_adds)
+        sums = c.sums + step_adds
+        return sums, lax.dynamic_update_slice(c.log, sums[None], (jnp.minimum(c.episode, program.episodes), 0))
+
+    def one_step(c: _Carry, draws: _Draws) -> tuple[_Carry, None]:
+        active = (c.episode < program.episodes).astype(jnp.float32)
+        action, abstained = select_action(c, draws.agent.explore, draws.agent.action)
+        if asks_raters:
+            action = lax.optimization_barrier(action)
+        next_state, reward, terminated, truncated = step(task, c.state, c.time, action)
+        rows, row = collect_ratings(c, action, reward, draws, abstained, active)
+        signal = filter_reward(c, action, reward, row)
+        target = signal.reward + jnp.where(terminated, 0.0, agent.gamma * next_value(c, rows, next_state))
+        rate = agent.learning_rate * active * signal.sample_weight * draws.agent.mask
+        if skips_when_abstaining:
+            rate = rate * (1.0 - abstained)
+        q = update(c, action, target, rate)
+        sums, log = log_step(c, action, abstained)
+        done = jnp.logical_or(terminated, truncated)
         episode = c.episode + done.astype(jnp.int32)
-        state = jnp.where(done, at(starts, episode % starts.shape[0]), state2)
+        state = jnp.where(done, at(starts, episode % starts.shape[0]), next_state)
         return _Carry(
             q=q,
             row=at(q, state),
-            feedback=feedback,
-            usual=c.usual,
+            rows=rows,
+            statistics=c.statistics,
             state=state,
             time=jnp.where(done, 0, c.time + 1),
             episode=episode,
@@ -227,32 +241,26 @@ def run(one: Lane, program: Program) -> Outcome:
         ), None
 
     def chunk(loop: tuple[_Carry, Array, Array, Array]) -> tuple[_Carry, Array, Array, Array]:
-        c, number, q_kept, f_kept = loop
-        key = jax.random.wrap_key_data(jnp.stack([one.seed, number]), impl="threefry2x32")
-        bits = jax.random.bits(key, (CHUNK, agent_words + rater_words), jnp.uint32)
-        own = tabular.draw(agent, bits[:, :agent_words], actions)
-        noise, rated = jnp.zeros((CHUNK, 0)), jnp.zeros((CHUNK, 0))
-        if listens:
-            noise = _normal(bits[:, agent_words:-1])
-            rated = (tabular.uniform(bits[:, -1]) < one.rated).astype(jnp.float32)
-            c = c._replace(usual=usual(c.feedback))
+        c, number, q_kept, rows_kept = loop
+        draws = _drawn(run, number, actions, raters if asks_raters else None)
+        if asks_raters:
+            c = c._replace(statistics=panel_statistics(c.rows))
         slot = c.episode * program.snapshots // program.episodes
-        c, _ = lax.scan(one_step, c, (own, noise, rated))
+        c, _ = lax.scan(one_step, c, draws)
         if program.snapshots:
             # A chunk can pass over several slots, so all that are left are filled; the next chunk overwrites them.
             later = (jnp.arange(program.snapshots) >= slot)[:, None, None, None]
             q_kept = jnp.where(later, c.q, q_kept)
-            f_kept = jnp.where(later, c.feedback, f_kept)
-        return c, number + 1, q_kept, f_kept
+            rows_kept = jnp.where(later, c.rows, rows_kept)
+        return c, number + 1, q_kept, rows_kept
 
-    key = jax.random.wrap_key_data(jnp.stack([one.seed, jnp.uint32(0)]), impl="threefry2x32")
-    q = tabular.init(agent, key, states, actions)
-    feedback = running.empty(states, actions)
+    q = tabular.init(agent, _key(run.seed, jnp.uint32(0)), states, actions)
+    rows = empty_rows((states, actions), raters, jnp, jnp.float32)
     start = _Carry(
         q=q,
         row=q[starts[0]],
-        feedback=feedback,
-        usual=usual(feedback),
+        rows=rows,
+        statistics=panel_statistics(rows),
         state=starts[0],
         time=jnp.int32(0),
         episode=jnp.int32(0),
@@ -261,11 +269,29 @@ def run(one: Lane, program: Program) -> Outcome:
         log=jnp.zeros((program.episodes + 1, len(LOG)), jnp.float32),
         steps=jnp.int32(0),
     )
-    kept = jnp.zeros((program.snapshots, *q.shape)), jnp.zeros((program.snapshots, *feedback.shape))
-    c, _, q_kept, f_kept = lax.while_loop(
+    kept = jnp.zeros((program.snapshots, *q.shape)), jnp.zeros((program.snapshots, *rows.shape))
+    c, _, q_kept, rows_kept = lax.while_loop(
         lambda loop: loop[0].episode < program.episodes, chunk, (start, jnp.uint32(1), *kept)
     )
-    return Outcome(c.log[:-1], c.steps, c.q, c.feedback, q_kept, f_kept)
+    return TrainedTables(c.log[:-1], c.steps, c.q, from_rows(c.rows), q_kept, from_rows(rows_kept))
+
+
+def _key(seed: Array, number: Array) -> Array:
+    return jax.random.wrap_key_data(jnp.stack([seed, number]), impl="threefry2x32")
+
+
+def _drawn(run: Run, number: Array, actions: int, raters: int | None) -> _Draws:
+    """Draw a chunk's random numbers from one call, which costs a fraction of drawing them step by step."""
+    own = tabular.words(run.agent)
+    quirky = raters is not None and run.law.quirks is not None
+    asked = 0 if raters is None else raters * (1 + UNIFORMS * quirky) + 1
+    bits = jax.random.bits(_key(run.seed, number), (CHUNK, own + asked), jnp.uint32)
+    agent = tabular.draw(run.agent, bits[:, :own], actions)
+    if raters is None:
+        return _Draws(agent, jnp.zeros((CHUNK, 0)), None, jnp.zeros((CHUNK, 0)))
+    normal = _normal(bits[:, own : own + raters])
+    uniform = tabular.uniform(bits[:, own + raters : -1]).reshape(CHUNK, raters, UNIFORMS) if quirky else None
+    return _Draws(agent, normal, uniform, (tabular.uniform(bits[:, -1]) < run.rated).astype(jnp.float32))
 
 
 # Giles' single-precision polynomials for the inverse error function, near the centre and in the tails.

@@ -1,1 +1,1 @@
-"""What a learner knows of its raters."""
+"""Models of ratings: what a learner knows of state-actions that nobody has rated."""

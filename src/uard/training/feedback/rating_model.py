@@ -1,9 +1,9 @@
 """What a deep learner knows of its raters: a memory of distinct rated steps, and a model of ratings for all others.
 
-``Memory`` is the tabular learner's running means (``running``), one row per slot, with the state-action behind it.
+``Memory`` has the tabular learner's rows of feedback, one per slot, with the state-action behind it.
 ``RatingModel`` regresses them: a small ensemble with fixed random priors predicts the mean rating, the lowest, their
 deviation sigma_h and the observed reward of any state-action, and how much it knows of it. Both answer with the same
-``Feedback``, so no mitigation can tell which of them it is listening to.
+``Feedback``, so no mitigation can tell which of them it is given.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from jax import Array, lax
 from uard import _checks
 from uard.agents.networks import Layer, descend, mlp, through
 from uard.method.mitigations import Feedback
-from uard.training.feedback import running
+from uard.ratings.aggregate import empty_rows, from_rows, merged, to_rows
 
-OUTPUTS = 4  # mean, lowest, spread, proxy: the columns of a row after its count
+OUTPUTS = 4  # mean, lowest, sd, proxy
 
 
 class Memory(NamedTuple):
-    """Running means of the ratings, by slot.
+    """What is known of ratings, by slot.
 
     Attributes:
-        rows: (M, running.FIELDS).
+        rows: (M, width) of feedback, see ``uard.ratings.aggregate``.
         states: The state last rated there, leaves (M, ...).
         actions: (M,), its action.
         order: (M,), slots in the order in which they were first rated.
@@ -42,24 +42,22 @@ class Memory(NamedTuple):
     rated: Array
 
 
-def memory(slots: int, state: Any) -> Memory:
+def memory(slots: int, state: Any, raters: int) -> Memory:
     """Return an empty memory for states like ``state``."""
     states = jax.tree.map(lambda x: jnp.zeros((slots, *jnp.shape(x)), jnp.asarray(x).dtype), state)
-    rows = running.empty(slots, 1)[:, 0]
+    rows = empty_rows((slots,), raters, jnp, jnp.float32)
     return Memory(rows, states, jnp.zeros(slots, jnp.int32), jnp.zeros(slots, jnp.int32), jnp.int32(0))
 
 
-def remember(
-    known: Memory, slot: Array, state: Any, action: Array, summary: running.Summary, proxy: Array, rated: Array
-) -> Memory:
-    """Return the memory after one more step; unchanged if ``rated`` is 0."""
+def remember(known: Memory, slot: Array, state: Any, action: Array, visit: Feedback, rated: Array) -> Memory:
+    """Return the memory after one more visit; unchanged if ``rated`` is 0."""
     row = known.rows[slot]
     first = (row[0] == 0) & (rated > 0)
     put = rated > 0
     states = jax.tree.map(lambda table, new: table.at[slot].set(jnp.where(put, new, table[slot])), known.states, state)
     place = jnp.minimum(known.rated, known.order.shape[0] - 1)
     return Memory(
-        known.rows.at[slot].set(running.updated(row, summary, proxy, rated)),
+        known.rows.at[slot].set(merged(row, to_rows(visit), rated)),
         states,
         known.actions.at[slot].set(jnp.where(put, action, known.actions[slot])),
         known.order.at[place].set(jnp.where(first, slot, known.order[place])),
@@ -134,17 +132,18 @@ def read(spec: RatingModel, model: Model, observations: Array, actions: int, rat
     before = spec.prior_scale**2 * through(model.prior, observations).var(0, ddof=1).mean(-1)
     after = out.var(0, ddof=1).mean(-1)
     count = jnp.maximum(before[:, None] / jnp.maximum(after, 1e-6) - 1.0, 0.0)
-    mean, lowest, spread, proxy = jnp.moveaxis(model.location + model.scale * out.mean(0), -1, 0)
-    return Feedback(count, mean, lowest, jnp.maximum(spread, 0.0), proxy, jnp.asarray(raters, jnp.float32))
+    mean, lowest, sd, proxy = jnp.moveaxis(model.location + model.scale * out.mean(0), -1, 0)
+    return Feedback(count, mean, lowest, jnp.maximum(sd, 0.0), proxy, jnp.full_like(mean, raters))
 
 
 def fit(spec: RatingModel, model: Model, known: Memory, observe: Any, actions: int, key: Array) -> Model:
     """Train for ``fits`` minibatches of distinct rated steps; unchanged before the first rating."""
-    seen = (known.rows[:, 0] > 0)[:, None]
-    total = jnp.maximum(seen.sum(), 1).astype(jnp.float32)
-    heard = known.rows[:, 1:]
-    location = jnp.where(seen, heard, 0.0).sum(0) / total
-    deviation = jnp.sqrt((jnp.where(seen, heard - location, 0.0) ** 2).sum(0) / total)
+    feedback = from_rows(known.rows)
+    rated = (feedback.count > 0)[:, None]
+    total = jnp.maximum(rated.sum(), 1).astype(jnp.float32)
+    targets = jnp.stack([feedback.mean, feedback.lowest, feedback.sd, feedback.proxy], axis=-1)
+    location = jnp.where(rated, targets, 0.0).sum(0) / total
+    deviation = jnp.sqrt((jnp.where(rated, targets - location, 0.0) ** 2).sum(0) / total)
     # One unit for all: the observed reward's deviation, as the mitigations' own.
     unit = jnp.where(deviation[-1] > 0, deviation[-1], 1.0)
     scale = jnp.full_like(deviation, 1.0) * unit
@@ -155,7 +154,7 @@ def fit(spec: RatingModel, model: Model, known: Memory, observe: Any, actions: i
         drawn = known.order[jax.random.randint(k, (spec.batch,), 0, jnp.maximum(known.rated, 1))]
         states = jax.tree.map(lambda x: x[drawn], known.states)
         observations = jax.vmap(observe)(states)
-        target = (heard[drawn] - location) / scale
+        target = (targets[drawn] - location) / scale
         here = jnp.arange(actions) == known.actions[drawn][:, None]
 
         def loss(layers: Any) -> Array:

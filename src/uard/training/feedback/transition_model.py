@@ -1,14 +1,14 @@
 """What a learner in a continuous world knows of its raters: a sample of rated steps, and a model for all others.
 
 No step comes twice, so there are no running means. ``Reservoir`` is a uniform sample of all steps rated so far (it must
-not forget what honest steps look like when the agent no longer takes them); ``TransitionModel`` regresses what each
-rater said, and how far apart they were, on (s, a, s', observed reward). sigma_h of a step is composed at use from the
+not forget what honest steps look like when the agent no longer takes them); ``TransitionModel`` regresses each rater's
+rating, and how far apart the raters are, on (s, a, s', observed reward). sigma_h of a step is composed at use from the
 predicted ratings and the reward that was observed, which tells hacks apart far better than a predicted spread. The
 lowest rating is that of the rater who is predicted to say least: what the lowest of several noisy ratings is on average
 sinks with the noise, and an agent that can end its episode then prefers to fall.
 
 Noise also makes predictions err, so that raters seem to differ, and steps to be disputed, where nothing is. Only that
-part of a difference counts that is more than the members' own deviation (``beyond``).
+part of a difference counts that is more than the members' own deviation (``soft_threshold``).
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ from jax import Array, lax
 
 from uard import _checks
 from uard.agents.networks import Layer, descend, mlp, through
-from uard.method.mitigations import Feedback, Mitigation, Usual
+from uard.method.feedback import Feedback
+from uard.method.mitigations import Mitigation, PanelStatistics
+from uard.ratings.aggregate import aggregate
 
 QUERIES = ("random", "doubtful")  # which steps are rated
 
@@ -44,7 +46,8 @@ class TransitionModel:
         prior_scale: Size of the fixed random functions, in units of the ratings' deviation, > 0. It says how much is
             unknown before anybody rates: where noise makes the members differ by as much, nothing counts as known.
         capacity: Rated steps kept.
-        deviations: Deviations of the members, >= 0, by which differences are reduced before they count; see ``beyond``.
+        deviations: Deviations of the members, >= 0, by which differences are reduced before they count; see
+            ``soft_threshold``.
     """
 
     members: int = 5
@@ -73,19 +76,19 @@ class Reservoir(NamedTuple):
 
     Attributes:
         inputs: (M, features) of the steps.
-        heard: (M, K + 1), what each rater said, and their deviation.
+        targets: (M, K + 1), each rater's rating (NaN where one is missing), and their deviation.
         seen: (1,), how many steps were rated so far.
     """
 
     inputs: np.ndarray
-    heard: np.ndarray
+    targets: np.ndarray
     seen: np.ndarray
 
 
-def features(observation: Any, action: Any, following: Any, reward: Any) -> Any:
+def features(observation: Any, action: Any, next_observation: Any, reward: Any) -> Any:
     """Return what the model sees of steps: (..., 2 F + D + 1)."""
     xp = jnp if isinstance(observation, jax.Array) else np
-    return xp.concatenate([observation, action, following - observation, reward[..., None]], -1)
+    return xp.concatenate([observation, action, next_observation - observation, reward[..., None]], -1)
 
 
 def width(features: int, actions: int) -> int:
@@ -95,21 +98,22 @@ def width(features: int, actions: int) -> int:
 
 def empty(spec: TransitionModel, width: int, raters: int) -> Reservoir:
     """Return a reservoir of nothing."""
-    inputs, heard = (np.zeros((spec.capacity, w), np.float32) for w in (width, raters + 1))
-    return Reservoir(inputs, heard, np.zeros(1, np.int64))
+    inputs, targets = (np.zeros((spec.capacity, w), np.float32) for w in (width, raters + 1))
+    return Reservoir(inputs, targets, np.zeros(1, np.int64))
 
 
-def keep(kept: Reservoir, inputs: np.ndarray, ratings: np.ndarray, random: np.random.Generator, ddof: int = 0) -> None:
-    """Put rated steps into the sample [Vitter 1985, algorithm R]; ratings (B, K)."""
-    capacity = len(kept.inputs)
-    spread = ratings.std(1, ddof=ddof) if ratings.shape[1] > 1 else np.zeros(len(ratings))
-    heard = np.column_stack([ratings, spread])
-    numbers = kept.seen[0] + np.arange(len(inputs))
+def keep(
+    reservoir: Reservoir, inputs: np.ndarray, ratings: np.ndarray, random: np.random.Generator, ddof: int = 0
+) -> None:
+    """Put rated steps into the sample [Vitter 1985, algorithm R]; ratings (B, K), NaN where one is missing."""
+    capacity = len(reservoir.inputs)
+    targets = np.column_stack([ratings, aggregate(ratings, np.zeros(len(ratings)), ddof=ddof).sd])
+    numbers = reservoir.seen[0] + np.arange(len(inputs))
     places = np.where(numbers < capacity, numbers, random.integers(0, numbers + 1))
-    for place, x, y in zip(places, inputs, heard, strict=True):  # in order: a later one may take an earlier's place
+    for place, x, y in zip(places, inputs, targets, strict=True):  # in order: a later one may take an earlier's place
         if place < capacity:
-            kept.inputs[place], kept.heard[place] = x, y
-    kept.seen[0] += len(inputs)
+            reservoir.inputs[place], reservoir.targets[place] = x, y
+    reservoir.seen[0] += len(inputs)
 
 
 def chosen(query: str, share: float, knows: Callable[[], np.ndarray], rows: int, random: np.random.Generator) -> Any:
@@ -135,7 +139,7 @@ def chosen(query: str, share: float, knows: Callable[[], np.ndarray], rows: int,
 
 
 class Model(NamedTuple):
-    """Layers, Adam's moments, and the units: location and scale of the inputs, location of what was said, its scale."""
+    """Layers, Adam's moments, and the units: location and scale of the inputs, location and scale of the targets."""
 
     layers: tuple[Layer, ...]
     prior: tuple[Layer, ...]
@@ -165,7 +169,7 @@ def _normal(model: Model, inputs: Array) -> Array:
     return jnp.clip((inputs - model.centre) / model.width, -5.0, 5.0)
 
 
-def beyond(differences: Array, deviations: float) -> Array:
+def soft_threshold(differences: Array, deviations: float) -> Array:
     """Return the mean over members (M, ...) less some of their deviations, 0 where it is not larger.
 
     Soft thresholding [Donoho 1995] at how far the members are apart.
@@ -184,14 +188,14 @@ def read(spec: TransitionModel, model: Model, inputs: Array, raters: int) -> Fee
     before = spec.prior_scale**2 * through(model.prior, x).var(0, ddof=1).mean(-1)
     after = out.var(0, ddof=1).mean(-1)
     count = jnp.maximum(before / jnp.maximum(after, 1e-6) - 1.0, 0.0)
-    said = model.location + model.scale * out
-    ratings = said[..., :-1]
+    predicted = model.location + model.scale * out
+    ratings = predicted[..., :-1]
     means = ratings.mean(-1, keepdims=True)
     mean = means.mean((0, 2))
-    lowest = mean + beyond(ratings - means, spec.deviations).min(-1)
+    lowest = mean + soft_threshold(ratings - means, spec.deviations).min(-1)
     typical = model.location[-1]
-    spread = jnp.maximum(typical + beyond(said[..., -1] - typical, spec.deviations), 0.0)
-    return Feedback(count, mean, lowest, spread, inputs[:, -1], jnp.asarray(raters, jnp.float32))
+    sd = jnp.maximum(typical + soft_threshold(predicted[..., -1] - typical, spec.deviations), 0.0)
+    return Feedback(count, mean, lowest, sd, inputs[:, -1], jnp.full_like(mean, raters))
 
 
 @partial(jax.jit, static_argnames="spec")
@@ -200,42 +204,60 @@ def worth(spec: TransitionModel, model: Model, inputs: Array) -> Array:
     return read(spec, model, inputs, 1).count
 
 
-def nothing(rows: int, raters: int) -> Feedback:
+def nothing(rows: int) -> Feedback:
     """Return the feedback of steps that nobody was asked about."""
-    zeros = jnp.zeros(rows, jnp.float32)
-    return Feedback(zeros, zeros, zeros, zeros, zeros, jnp.asarray(raters, jnp.float32))
+    return Feedback(*[jnp.zeros(rows, jnp.float32)] * 6)
 
 
-def usual(mitigation: Mitigation, spec: TransitionModel, model: Any, kept: Array, seen: Array, raters: int) -> Any:
-    """Return what is usual over the rated steps that were kept; ``model`` () was never asked."""
+def panel_statistics(
+    mitigation: Mitigation, spec: TransitionModel, model: Any, sample: Array, seen: Array, raters: int
+) -> Any:
+    """Return the mitigation's statistics over the sampled rated steps; ``model`` () was never asked.
+
+    Args:
+        mitigation: Whose.
+        spec: Of the model.
+        model: Predicts the feedback of the steps.
+        sample: (M, width) inputs of the steps.
+        seen: How many steps were rated so far.
+        raters: K.
+    """
     if model == ():
-        return mitigation.usual(nothing(1, raters), jnp.zeros(1, bool))
-    feedback = read(spec, model, kept, raters)
-    return mitigation.usual(feedback, (jnp.arange(kept.shape[0]) < seen) & (feedback.count > 0))
+        return mitigation.fit(nothing(1), jnp.zeros(1, bool))
+    feedback = read(spec, model, sample, raters)
+    return mitigation.fit(feedback, (jnp.arange(sample.shape[0]) < seen) & (feedback.count > 0))
 
 
-def expecting(usual: Any, feedback: Feedback) -> Any:
-    """Return what is usual, with what each step is predicted to be worth at least in the place of what all are.
+def expecting(statistics: Any, feedback: Feedback) -> Any:
+    """Return statistics in which each step's own predicted lowest rating stands for that of all steps.
 
     Anchors of few ratings are drawn towards the latter. A prediction is a regression's: it has been drawn already, and
     once more would make all steps, good and bad, look alike.
     """
-    return usual._replace(lowest=feedback.lowest) if isinstance(usual, Usual) else usual
+    return statistics._replace(lowest=feedback.lowest) if isinstance(statistics, PanelStatistics) else statistics
 
 
-@partial(jax.jit, static_argnames="spec")
-def fit(spec: TransitionModel, model: Model, inputs: Array, heard: Array, seen: Array, key: Array) -> Model:
-    """Train for ``fits`` minibatches of the first ``seen`` rows; unchanged before the first."""
+def fit(spec: TransitionModel, model: Model, reservoir: Reservoir, key: Array) -> Model:
+    """Train for ``fits`` minibatches of what the reservoir holds; unchanged before the first rating."""
+    gaps = bool(np.isnan(reservoir.targets).any())
+    return _fit(spec, model, reservoir.inputs, reservoir.targets, reservoir.seen[0], key, gaps=gaps)
+
+
+@partial(jax.jit, static_argnames=("spec", "gaps"))
+def _fit(
+    spec: TransitionModel, model: Model, inputs: Array, targets: Array, seen: Array, key: Array, *, gaps: bool
+) -> Model:
+    """Train on the first ``seen`` rows; with ``gaps`` a target of NaN is a rating that is missing."""
     filled = jnp.minimum(seen, inputs.shape[0])
     mask = (jnp.arange(inputs.shape[0]) < filled)[:, None]
-    total = jnp.maximum(filled, 1).astype(jnp.float32)
 
-    def moments(x: Array) -> tuple[Array, Array]:
-        centre = jnp.where(mask, x, 0.0).sum(0) / total
-        return centre, jnp.sqrt(jnp.where(mask, (x - centre) ** 2, 0.0).sum(0) / total)
+    def moments(x: Array, here: Array) -> tuple[Array, Array]:
+        total = jnp.maximum(here.sum(0), 1).astype(jnp.float32) if gaps else jnp.maximum(filled, 1).astype(jnp.float32)
+        centre = jnp.where(here, x, 0.0).sum(0) / total
+        return centre, jnp.sqrt(jnp.where(here, (x - centre) ** 2, 0.0).sum(0) / total)
 
-    centre, width = moments(inputs)
-    location, deviation = moments(heard)
+    centre, width = moments(inputs, mask)
+    location, deviation = moments(targets, mask & ~jnp.isnan(targets) if gaps else mask)
     width = jnp.where(width > 1e-6, width, 1.0)
     typical = deviation[:-1].mean()
     scale = jnp.where(typical > 1e-6, typical, 1.0)
@@ -245,11 +267,13 @@ def fit(spec: TransitionModel, model: Model, inputs: Array, heard: Array, seen: 
         layers, optimiser = carry
         drawn = jax.random.randint(k, (spec.members, spec.batch), 0, jnp.maximum(filled, 1))
         x = _normal(model, inputs[drawn])
-        target = (heard[drawn] - location) / scale
+        target = (targets[drawn] - location) / scale
 
         def loss(layers: Any) -> Array:
             out = _predict(spec, layers, model.prior, x)
-            return optax.losses.huber_loss(out, target).mean((1, 2)).sum()
+            # A missing rating is as if it had been predicted.
+            aim = jnp.where(jnp.isnan(target), lax.stop_gradient(out), target) if gaps else target
+            return optax.losses.huber_loss(out, aim).mean((1, 2)).sum()
 
         return descend(spec.learning_rate, jax.grad(loss)(layers), optimiser, layers), None
 

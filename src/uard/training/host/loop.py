@@ -1,11 +1,12 @@
-"""Training in MuJoCo: physics on the host, networks in compiled functions, everything resumable to the bit.
+"""Training on a simulator: physics on the host, networks in compiled functions, everything resumable to the bit.
 
-A run's whole state is one pytree of arrays (``Live``). It is advanced by pieces (a rollout, or some steps with their
+A run's whole state is one pytree of arrays (``TrainState``). It is advanced by pieces (a rollout, or some steps with their
 updates); between pieces it can be written down and taken up again, and no random number depends on when that happened.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,12 +16,10 @@ import jax
 import numpy as np
 
 from uard import _checks
-from uard.agents.continuous import ContinuousActorCritic
-from uard.agents.policy import PolicyGradient
-from uard.envs.locomotion import physics as mujoco
-from uard.envs.locomotion.physics import Locomotion, Moved, Physics
+from uard.envs.base import SimulatedEnvironment
+from uard.envs.simulator import Simulator, StepResult, rate
 from uard.method.mitigations import Mitigation
-from uard.ratings import panels
+from uard.ratings.panels import MAIN, Panel
 from uard.training import checkpoint
 from uard.training.episode_log import LOG
 from uard.training.feedback import transition_model as transitions
@@ -34,7 +33,7 @@ class Job:
     """One run.
 
     Attributes:
-        spec: Where.
+        environment: Where.
         agent: Who learns.
         mitigation: What it does about a reward that may lie.
         seed: Of everything.
@@ -42,43 +41,46 @@ class Job:
         panel: Who rates.
         noise: Extra noise of every rater, in reward units.
         rated: Fraction of steps that are rated.
-        feedback: The model of the ratings.
-        ddof: Of the annotators' deviation.
+        rating_model: The model of the ratings.
+        ddof: Of the raters' deviation.
         evaluations: Episodes without exploration after training.
-        query: Which steps are rated; see ``transitions.chosen``.
+        query: Which steps are rated; see ``transition_model.chosen``.
     """
 
-    spec: Locomotion
+    environment: SimulatedEnvironment
     agent: Any
     mitigation: Mitigation
     seed: int = 0
     steps: int = 1_000_000
-    panel: str = "main"
+    panel: Panel = MAIN
     noise: float = 0.0
     rated: float = 0.15
-    feedback: TransitionModel = field(default_factory=TransitionModel)
+    rating_model: TransitionModel = field(default_factory=TransitionModel)
     ddof: int = 0
     evaluations: int = 8
     query: str = "random"
 
     def __post_init__(self) -> None:
         """Check the parameters."""
-        panels.check(self.panel, self.noise)
+        if not isinstance(self.panel, Panel):
+            raise _checks.InvalidValueError("panel", self.panel, "a Panel (see uard.ratings.panels.PANELS)")
+        _checks.number("noise", self.noise, low=0)
         _checks.whole("steps", self.steps, low=1, high=10**12)
         _checks.number("rated", self.rated, low=0, high=1)
         _checks.whole("evaluations", self.evaluations, low=1, high=1000)
         _checks.choose("query", self.query, QUERIES)
 
     @property
-    def listens(self) -> bool:
+    def asks_raters(self) -> bool:
         """Whether ratings are used at all."""
         return self.mitigation.reads_feedback
 
     @property
     def fixed(self) -> Fixed:
         """Return what compiled functions need of it."""
-        raters = panels.raters(self.panel)
-        return Fixed(self.agent, self.mitigation, self.feedback, self.listens, raters, self.spec.horizon)
+        raters = len(self.panel.raters)
+        horizon = self.environment.horizon
+        return Fixed(self.agent, self.mitigation, self.rating_model, self.asks_raters, raters, horizon)
 
 
 class Fixed(NamedTuple):
@@ -86,8 +88,8 @@ class Fixed(NamedTuple):
 
     agent: Any
     mitigation: Mitigation
-    feedback: TransitionModel
-    listens: bool
+    rating_model: TransitionModel
+    asks_raters: bool
     raters: int
     horizon: int
 
@@ -117,7 +119,7 @@ class Norm(NamedTuple):
         return np.clip((observations - self.mean) / np.sqrt(self.variance + 1e-8), -10.0, 10.0).astype(np.float32)
 
 
-class Live(NamedTuple):
+class TrainState(NamedTuple):
     """All that a run's future depends on; a pytree of arrays.
 
     Attributes:
@@ -126,7 +128,7 @@ class Live(NamedTuple):
         model: The model of the ratings, or ().
         reservoir: The rated steps, or ().
         extra: What the loop keeps besides: a replay buffer.
-        physics: See ``Physics.save``.
+        simulator: See ``Simulator.save``.
         sums: (E, len(LOG)), of the running episodes.
         log: (episodes, len(LOG) + 1): sums of the finished ones, and the step at which each ended.
         steps: Environment steps so far.
@@ -137,27 +139,27 @@ class Live(NamedTuple):
     model: Any
     reservoir: Any
     extra: Any
-    physics: dict[str, np.ndarray]
+    simulator: dict[str, np.ndarray]
     sums: np.ndarray
     log: np.ndarray
     steps: Any
 
 
-class Done(NamedTuple):
+class TrainedRun(NamedTuple):
     """What a run leaves behind.
 
     Attributes:
-        log: (episodes, len(LOG)), in the order in which they ended; ``goal`` is whether the horizon was reached.
+        log: (episodes, len(LOG)), in the order in which they ended.
         ends: (episodes,), the environment step at which each ended.
         evaluation: (evaluations, len(LOG) + 1) of the trained agent without exploration; the last column is the task's
             own return.
-        live: The last state.
+        state: The last state.
     """
 
     log: np.ndarray
     ends: np.ndarray
     evaluation: np.ndarray
-    live: Live
+    state: TrainState
 
 
 def key_of(seed: int, stream: int, number: int = 0) -> Any:
@@ -170,103 +172,109 @@ def generator(seed: int, stream: int, number: int) -> np.random.Generator:
     return np.random.default_rng([seed, stream, number])
 
 
-def counted(moved: Moved) -> np.ndarray:
+def counted(result: StepResult) -> np.ndarray:
     """Return what steps add to their episodes' rows of the log, (E, len(LOG))."""
-    nothing = np.zeros(len(moved.reward))
-    columns = [moved.hack, moved.true, moved.reward, moved.truncated, nothing + 1.0, nothing]
+    zeros = np.zeros(len(result.reward))
+    columns = [result.hack, result.true_reward, result.reward, result.success, zeros + 1.0, zeros]
     return np.stack([np.asarray(c, float) for c in columns], 1)
 
 
-class Book:
-    """The log while it is being written."""
+class EpisodeLog:
+    """The log while it is being written. Changed in place."""
 
     def __init__(self, sums: np.ndarray, steps: int):
-        """Go on from the running episodes' sums."""
+        """Go on from the running episodes' sums (E, len(LOG)) at an environment step."""
         self.sums, self.steps, self.rows = sums.copy(), steps, []
 
-    def write(self, moved: Moved) -> None:
-        """Write one step of all copies down."""
-        self.sums += counted(moved)
+    def add(self, result: StepResult) -> None:
+        """Add one step of all copies."""
+        self.sums += counted(result)
         self.steps += len(self.sums)
-        over = moved.terminated | moved.truncated
-        for i in np.nonzero(over)[0]:
+        done = result.terminated | result.truncated
+        for i in np.nonzero(done)[0]:
             self.rows.append(np.append(self.sums[i], self.steps))
-        self.sums[over] = 0.0
+        self.sums[done] = 0.0
 
     def all(self, log: np.ndarray) -> np.ndarray:
-        """Return the log so far."""
-        return np.concatenate([log, np.array(self.rows).reshape(-1, len(LOG) + 1)])
+        """Return the log so far, (episodes, len(LOG) + 1)."""
+        return np.concatenate([log, np.array(self.rows).reshape(-1, len(LOG) + 1)]) if self.rows else log
 
 
-def unheard(job: Job) -> tuple[Any, Any]:
-    """Return a fresh model of the ratings and a reservoir without any; () and () for who asks nobody."""
-    if not job.listens:
+def fresh_feedback(job: Job) -> tuple[Any, Any]:
+    """Return a fresh model of the ratings and an empty reservoir; () and () for a mitigation that asks nobody."""
+    if not job.asks_raters:
         return (), ()
-    width, raters = transitions.width(job.spec.features, job.spec.actions), job.fixed.raters
-    model = transitions.init(job.feedback, key_of(job.seed, MODEL), width, raters)
-    return model, transitions.empty(job.feedback, width, raters)
+    width, raters = transitions.width(job.environment.features, job.environment.actions), job.fixed.raters
+    model = transitions.init(job.rating_model, key_of(job.seed, MODEL), width, raters)
+    return model, transitions.empty(job.rating_model, width, raters)
 
 
-def record(job: Job, live: Live, steps: list[Moved], inputs: np.ndarray, number: int) -> None:
-    """Put the rated fraction of (T, E) steps to the panel, and keep what it says."""
+def collect_ratings(job: Job, state: TrainState, steps: list[StepResult], inputs: np.ndarray, number: int) -> None:
+    """Put the rated fraction of (T, E) steps to the panel, and keep its ratings in the state's reservoir.
+
+    Args:
+        job: The run.
+        state: Its state; the reservoir is changed in place.
+        steps: T results of E copies.
+        inputs: (T, E, width), what the model of ratings sees of them.
+        number: Of the piece.
+    """
     random = generator(job.seed, PANEL, number)
     flat = inputs.reshape(-1, inputs.shape[-1])
 
     def knows() -> np.ndarray:
-        return np.asarray(transitions.worth(job.feedback, live.model, flat))
+        return np.asarray(transitions.worth(job.rating_model, state.model, flat))
 
     rated = transitions.chosen(job.query, job.rated, knows, len(flat), random).reshape(inputs.shape[:2])
-    said = np.stack([mujoco.rate(job.panel, moved, job.noise, random) for moved in steps])
-    transitions.keep(live.reservoir, inputs[rated], said[rated], random, job.ddof)
+    ratings = np.stack([rate(job.panel, result, job.noise, random) for result in steps])
+    rated &= ~np.isnan(ratings).all(-1)  # a panel in which everybody skipped the step has not rated it
+    transitions.keep(state.reservoir, inputs[rated], ratings[rated], random, job.ddof)
 
 
-class Loop(NamedTuple):
+class Loop(ABC):
     """How a run starts, how it advances by a piece, and what its agent does and believes.
 
     Attributes:
-        copies: Of the robot.
-        start: Gives the first state.
-        advance: Trains one piece.
-        act: The most likely actions at observations (B, features): (B, motors), not clipped.
-        values: All critics' opinions of observations' values under those actions, (N, B).
+        job: The run.
+        copies: Of the environment.
     """
 
+    job: Job
     copies: int
-    start: Callable[[Physics], Live]
-    advance: Callable[[Live, Physics], Live]
-    act: Callable[[Live, np.ndarray], np.ndarray]
-    values: Callable[[Live, np.ndarray], np.ndarray]
 
+    @abstractmethod
+    def start(self, simulator: Simulator) -> TrainState:
+        """Return the first state."""
 
-def bind(job: Job) -> Loop:
-    """Return a run's loop.
+    @abstractmethod
+    def advance(self, state: TrainState, simulator: Simulator) -> TrainState:
+        """Train one piece.
 
-    Raises:
-        InvalidValueError: the agent cannot move motors.
-    """
-    from uard.training.host import off_policy as host_off_policy
-    from uard.training.host import on_policy as host_on_policy
+        Raises:
+            FloatingPointError: something left the finite numbers.
+        """
 
-    if isinstance(job.agent, PolicyGradient):
-        return host_on_policy.bind(job)
-    if isinstance(job.agent, ContinuousActorCritic):
-        return host_off_policy.bind(job)
-    able = "one for continuous actions: PPO, TRPO, CPO, SAC, CQL, EDAC, SUNRISE"
-    raise _checks.InvalidValueError("agent", job.agent, able)
+    @abstractmethod
+    def act(self, state: TrainState, observations: np.ndarray) -> np.ndarray:
+        """Return the most likely actions at observations (B, features): (B, actions), not clipped."""
+
+    @abstractmethod
+    def values(self, state: TrainState, observations: np.ndarray) -> np.ndarray:
+        """Return all critics' values of observations under those actions, (N, B)."""
 
 
 def run(
-    job: Job,
+    loop: Loop,
     path: Path | None = None,
     config: str = "",
     every: int = 50_000,
     progress: Callable[[int, int], None] | None = None,
     stop: Callable[[], bool] | None = None,
-) -> Done:
+) -> TrainedRun:
     """Train, going on from the checkpoint at ``path`` if there is one.
 
     Args:
-        job: The run.
+        loop: Of the run; ``uard.training.trainers.host_loop`` finds it.
         path: Where to keep the checkpoint; nowhere if None.
         config: What the run is, as text, so that no other run's checkpoint is gone on from.
         every: Environment steps between checkpoints.
@@ -278,39 +286,43 @@ def run(
             last good checkpoint is kept.
         CheckpointError: the checkpoint is truncated, or of another configuration.
     """
-    loop = bind(job)
-    physics = Physics(job.spec, loop.copies, job.seed)
+    job = loop.job
+    simulator = job.environment.simulator(loop.copies, job.seed)
     try:
-        live = loop.start(physics)
+        state = loop.start(simulator)
         if path is not None and path.exists():
-            live = checkpoint.load(path, config, live)
-            physics.load(live.physics)
-        saved = int(live.steps)
-        while live.steps < job.steps:
+            state = checkpoint.load(path, config, state)
+            simulator.load(state.simulator)
+        saved = int(state.steps)
+        while state.steps < job.steps:
             try:
-                live = loop.advance(live, physics)
+                state = loop.advance(state, simulator)
             except FloatingPointError as error:
-                raise FloatingPointError(f"{error} (environment step {int(live.steps)} of seed {job.seed})") from error
+                where = f"environment step {int(state.steps)} of seed {job.seed}"
+                raise FloatingPointError(f"{error} ({where})") from error
             if progress:
-                progress(min(int(live.steps), job.steps), job.steps)
+                progress(min(int(state.steps), job.steps), job.steps)
             stopped = stop is not None and stop()
-            if path is not None and (stopped or live.steps - saved >= every):
-                checkpoint.save(path, config, live)
-                saved = int(live.steps)
+            if path is not None and (stopped or state.steps - saved >= every):
+                checkpoint.save(path, config, state)
+                saved = int(state.steps)
             if stopped:
                 raise KeyboardInterrupt
     finally:
-        physics.close()
-    return Done(live.log[:, :-1], live.log[:, -1], evaluate(job, live, loop.act), live)
+        simulator.close()
+    return TrainedRun(state.log[:, :-1], state.log[:, -1], evaluate(loop, state), state)
 
 
-def evaluate(job: Job, live: Live, act: Callable[[Live, np.ndarray], np.ndarray]) -> np.ndarray:
-    """Let the trained agent run without exploration, one episode per copy."""
-    physics = Physics(job.spec, job.evaluations, int(generator(job.seed, EVALUATION, 0).integers(2**63)))
+def evaluate(loop: Loop, state: TrainState) -> np.ndarray:
+    """Let the trained agent run without exploration, one episode per copy; see ``TrainedRun.evaluation``."""
+    job = loop.job
+    seed = int(generator(job.seed, EVALUATION, 0).integers(2**63))
+    simulator = job.environment.simulator(job.evaluations, seed)
     rows = np.zeros((job.evaluations, len(LOG) + 1))
     going = np.ones(job.evaluations, bool)
     while going.any():
-        moved = physics.step(np.clip(act(live, physics.observe()), -1.0, 1.0))
-        rows[going] += np.column_stack([counted(moved), moved.task])[going]
-        going &= ~(moved.terminated | moved.truncated)
+        result = simulator.step(np.clip(loop.act(state, simulator.observe()), -1.0, 1.0))
+        rows[going] += np.column_stack([counted(result), result.task_reward])[going]
+        going &= ~(result.terminated | result.truncated)
+    simulator.close()
     return rows

@@ -1,135 +1,167 @@
-"""SAC and its family in MuJoCo: a piece of the run is some steps, and as many updates in one call."""
+"""SAC and its family on a simulator: a piece of the run is some steps, and as many updates in one call."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from uard.agents.continuous import Batch, ContinuousActorCritic
-from uard.envs.locomotion.physics import Physics
-from uard.method.mitigations import Evidence, as_column
+from uard.agents.continuous import ContinuousActorCritic
+from uard.agents.off_policy import Transitions
+from uard.envs.simulator import Simulator, StepResult
+from uard.method.mitigations import Evidence, LearningSignal
 from uard.training.episode_log import LOG
 from uard.training.feedback import transition_model as transitions
-from uard.training.host import loop as host
-from uard.training.host.loop import Book, Fixed, Job, Live, Loop, Norm
+from uard.training.host import loop
+from uard.training.host.loop import EpisodeLog, Fixed, Job, Loop, Norm, TrainState
 
 PIECE = 32  # steps between calls of the compiled update
 FIT_EVERY = 64  # pieces between fits of the model of ratings: 2048 steps
 
 
 class Buffer(NamedTuple):
-    """Transitions, on the device: (M, F) observations and what followed, (M, D) actions, (M,) reward and end."""
+    """Transitions, on the device: (M, F) observations before and after, (M, D) actions, (M,) reward and end."""
 
     observation: Any
     action: Any
-    following: Any
+    next_observation: Any
     reward: Any
     terminated: Any
 
 
 class Kept(NamedTuple):
-    """What the loop keeps besides: the buffer, and what is usual of the ratings."""
+    """What the loop keeps besides: the buffer, and the panel's statistics."""
 
     buffer: Buffer
-    usual: Any
+    statistics: Any
 
 
-def bind(job: Job) -> Loop:
-    """Return a run's loop; a piece is ``PIECE`` steps."""
-    agent, spec = job.agent, job.spec
-    width = transitions.width(spec.features, spec.actions)
-    slots = min(agent.buffer, -(-job.steps // PIECE) * PIECE)
-    fixed = job.fixed
+@final
+class OffPolicyLoop(Loop):
+    """The loop of agents that learn from a replay buffer; it steps one copy."""
 
-    def start(physics: Physics) -> Live:
-        model, reservoir = host.unheard(job)
-        sizes = (spec.features,), (spec.actions,), (spec.features,), ()
-        buffer = Buffer(*(jnp.zeros((slots, *size), jnp.float32) for size in sizes), terminated=jnp.zeros(slots, bool))
-        return Live(
-            agent=agent.init(host.key_of(job.seed, host.INIT), spec.features, spec.actions),
-            norm=Norm.start(spec.features),
+    def __init__(self, job: Job):
+        """Bind a run."""
+        self.job, self.copies = job, 1
+        self._fixed = job.fixed
+        self._width = transitions.width(job.environment.features, job.environment.actions)
+        self._slots = min(job.agent.buffer, -(-job.steps // PIECE) * PIECE)
+
+    def start(self, simulator: Simulator) -> TrainState:
+        """Return the first state."""
+        job, environment = self.job, self.job.environment
+        model, reservoir = loop.fresh_feedback(job)
+        sizes = (environment.features,), (environment.actions,), (environment.features,), ()
+        columns = (jnp.zeros((self._slots, *size), jnp.float32) for size in sizes)
+        buffer = Buffer(*columns, terminated=jnp.zeros(self._slots, bool))
+        return TrainState(
+            agent=job.agent.init(loop.key_of(job.seed, loop.INIT), environment.features, environment.actions),
+            norm=Norm.start(environment.features),
             model=model,
             reservoir=reservoir,
-            extra=Kept(buffer, _usual(model, *_known(reservoir, width), job=fixed)),
-            physics=physics.save(),
+            extra=Kept(buffer, self._panel_statistics(model, reservoir)),
+            simulator=simulator.save(),
             sums=np.zeros((1, len(LOG))),
             log=np.zeros((0, len(LOG) + 1)),
             steps=np.int64(0),
         )
 
-    def advance(live: Live, physics: Physics) -> Live:
-        done = int(live.steps)
-        number = done // PIECE
-        random = host.generator(job.seed, host.ACT, number)
-        keys = jax.random.split(host.key_of(job.seed, host.ACT, number), PIECE)
-        book = Book(live.sums, done)
-        here, actions, steps = [], [], []
-        for t in range(PIECE):
-            observation = physics.observe()
-            if done + t < agent.warmup:
-                action = random.uniform(-1.0, 1.0, (1, spec.actions))
-            else:
-                action = np.asarray(_act(live.agent, observation.astype(np.float32), keys, t, agent=agent))
-            moved = physics.step(action)
-            book.write(moved)
-            here.append(observation)
-            actions.append(action)
-            steps.append(moved)
-        reward = np.stack([m.reward for m in steps])
-        row = Buffer(
-            np.concatenate(here).astype(np.float32),
-            np.concatenate(actions).astype(np.float32),
-            np.concatenate([m.observation for m in steps]).astype(np.float32),
-            reward[:, 0].astype(np.float32),
-            np.concatenate([m.terminated for m in steps]),
+    def advance(self, state: TrainState, simulator: Simulator) -> TrainState:
+        """Take some steps, collect ratings, and make as many updates on filtered rewards; then log."""
+        number = int(state.steps) // PIECE
+        log = EpisodeLog(state.sums, int(state.steps))
+        row, results = self._step(state, simulator, number, log)
+        model, statistics = self._collect_ratings(state, row, results, number)
+        learner, buffer = self._update(state, row, model, statistics, number)
+        return state._replace(
+            agent=learner,
+            model=model,
+            extra=Kept(buffer, statistics),
+            simulator=simulator.save(),
+            sums=log.sums,
+            log=log.all(state.log),
+            steps=np.int64(log.steps),
         )
-        model, usual = live.model, live.extra.usual
-        if job.listens:
-            told = transitions.features(row.observation, row.action, row.following, row.reward)
-            host.record(job, live, steps, told[:, None], number)
-            if number % FIT_EVERY == FIT_EVERY - 1:
-                key = host.key_of(job.seed, host.MODEL, number + 1)
-                model = transitions.fit(job.feedback, model, *live.reservoir[:2], live.reservoir.seen[0], key)
-                usual = _usual(model, *_known(live.reservoir, width), job=fixed)
+
+    def _step(
+        self, state: TrainState, simulator: Simulator, number: int, log: EpisodeLog
+    ) -> tuple[Buffer, list[StepResult]]:
+        """Let the agent act for a piece; during the warm-up its actions are uniformly random."""
+        agent, done = self.job.agent, int(state.steps)
+        random = loop.generator(self.job.seed, loop.ACT, number)
+        keys = jax.random.split(loop.key_of(self.job.seed, loop.ACT, number), PIECE)
+        observations, actions, results = [], [], []
+        for t in range(PIECE):
+            observation = simulator.observe()
+            if done + t < agent.warmup:
+                action = random.uniform(-1.0, 1.0, (1, self.job.environment.actions))
+            else:
+                action = np.asarray(_act(state.agent, observation.astype(np.float32), keys, t, agent=agent))
+            results.append(simulator.step(action))
+            log.add(results[-1])
+            observations.append(observation)
+            actions.append(action)
+        row = Buffer(
+            np.concatenate(observations).astype(np.float32),
+            np.concatenate(actions).astype(np.float32),
+            np.concatenate([r.observation for r in results]).astype(np.float32),
+            np.concatenate([r.reward for r in results]).astype(np.float32),
+            np.concatenate([r.terminated for r in results]),
+        )
+        return row, results
+
+    def _collect_ratings(
+        self, state: TrainState, row: Buffer, results: list[StepResult], number: int
+    ) -> tuple[Any, Any]:
+        """Put the piece to the panel; now and then fit the model of ratings and the panel's statistics anew."""
+        job, model, statistics = self.job, state.model, state.extra.statistics
+        if not job.asks_raters:
+            return model, statistics
+        inputs = transitions.features(row.observation, row.action, row.next_observation, row.reward)
+        loop.collect_ratings(job, state, results, inputs[:, None], number)
+        if number % FIT_EVERY == FIT_EVERY - 1:
+            key = loop.key_of(job.seed, loop.MODEL, number + 1)
+            reservoir = state.reservoir
+            model = transitions.fit(job.rating_model, model, reservoir, key)
+            statistics = self._panel_statistics(model, reservoir)
+        return model, statistics
+
+    def _panel_statistics(self, model: Any, reservoir: Any) -> Any:
+        known = (reservoir.inputs, reservoir.seen[0]) if reservoir else self._unknown()
+        return _panel_statistics(model, *known, job=self._fixed)
+
+    def _unknown(self) -> tuple[np.ndarray, np.int64]:
+        return np.zeros((1, self._width), np.float32), np.int64(0)
+
+    def _update(self, state: TrainState, row: Buffer, model: Any, statistics: Any, number: int) -> tuple[Any, Buffer]:
+        """Return the agent after as many updates as there were steps, and the buffer with these steps."""
+        done = int(state.steps)
         learner, buffer, fine = _learn(
-            live.agent,
-            live.extra.buffer,
+            state.agent,
+            state.extra.buffer,
             row,
             np.int32(done),
             model,
-            usual,
-            host.key_of(job.seed, host.LEARN, number),
-            job=fixed,
-            learns=done + PIECE > agent.warmup,
+            statistics,
+            loop.key_of(self.job.seed, loop.LEARN, number),
+            job=self._fixed,
+            learns=done + PIECE > self.job.agent.warmup,
         )
         if not fine:
             raise FloatingPointError("the agent's parameters or its values left the finite numbers")
-        return live._replace(
-            agent=learner,
-            model=model,
-            extra=Kept(buffer, usual),
-            physics=physics.save(),
-            sums=book.sums,
-            log=book.all(live.log) if book.rows else live.log,
-            steps=np.int64(book.steps),
-        )
+        return learner, buffer
 
-    def act(live: Live, observations: np.ndarray) -> np.ndarray:
-        return np.asarray(_greedy(live.agent, observations.astype(np.float32), agent=agent))
+    def act(self, state: TrainState, observations: np.ndarray) -> np.ndarray:
+        """Return the policy's middle actions, (B, actions)."""
+        return np.asarray(_greedy(state.agent, observations.astype(np.float32), agent=self.job.agent))
 
-    def values(live: Live, observations: np.ndarray) -> np.ndarray:
-        return np.asarray(_values(live.agent, observations.astype(np.float32), agent=agent))
-
-    return Loop(1, start, advance, act, values)
-
-
-def _known(reservoir: Any, width: int) -> tuple[Any, Any]:
-    return (reservoir.inputs, reservoir.seen[0]) if reservoir else (np.zeros((1, width), np.float32), np.int64(0))
+    def values(self, state: TrainState, observations: np.ndarray) -> np.ndarray:
+        """Return all critics' values, (N, B)."""
+        return np.asarray(_values(state.agent, observations.astype(np.float32), agent=self.job.agent))
 
 
 @partial(jax.jit, static_argnames="agent")
@@ -148,8 +180,8 @@ def _values(state: Any, observations: Array, *, agent: ContinuousActorCritic) ->
 
 
 @partial(jax.jit, static_argnames="job")
-def _usual(model: Any, kept: Array, seen: Array, *, job: Fixed) -> Any:
-    return transitions.usual(job.mitigation, job.feedback, model, kept, seen, job.raters)
+def _panel_statistics(model: Any, sample: Array, seen: Array, *, job: Fixed) -> Any:
+    return transitions.panel_statistics(job.mitigation, job.rating_model, model, sample, seen, job.raters)
 
 
 @partial(jax.jit, static_argnames=("job", "learns"), donate_argnums=(0, 1))
@@ -159,14 +191,14 @@ def _learn(
     row: Buffer,
     done: Array,
     model: Any,
-    usual: Any,
+    statistics: Any,
     key: Array,
     *,
     job: Fixed,
     learns: bool,
 ) -> tuple[Any, Buffer, Array]:
     """Put a piece's transitions into the buffer, and take as many updates; also say whether all is finite."""
-    agent, mitigation, model_spec, listens, raters, _ = job
+    agent, mitigation, rating_model, asks_raters, raters, _ = job
     slots = buffer.reward.shape[0]
     count = row.reward.shape[0]
     buffer = jax.tree.map(lambda kept, new: lax.dynamic_update_slice_in_dim(kept, new, done % slots, 0), buffer, row)
@@ -174,29 +206,27 @@ def _learn(
         return state, buffer, jnp.asarray(True)
     filled = jnp.minimum(done + count, slots)
 
-    def one(state: Any, key: Array) -> tuple[Any, Array]:
+    def update(state: Any, key: Array) -> tuple[Any, Array]:
         draw_key, mask_key, learn_key = jax.random.split(key, 3)
         places = jax.random.randint(draw_key, (agent.batch,), 0, filled)
         drawn = jax.tree.map(lambda x: x[places], buffer)
-        if listens:
-            told = transitions.features(drawn.observation, drawn.action, drawn.following, drawn.reward)
-            feedback = transitions.read(model_spec, model, told, raters)
+        if asks_raters:
+            inputs = transitions.features(drawn.observation, drawn.action, drawn.next_observation, drawn.reward)
+            feedback = transitions.read(rating_model, model, inputs, raters)
         else:
-            feedback = transitions.nothing(agent.batch, raters)
-        alone = as_column(feedback)
+            feedback = transitions.nothing(agent.batch)
+        expected = transitions.expecting(statistics, feedback)
 
-        expected = transitions.expecting(usual, feedback)
+        def reward_fn(sigma_m: Array) -> LearningSignal:
+            return mitigation.signal(Evidence(drawn.reward, sigma_m, feedback), expected)
 
-        def judge(sigma: Array) -> Any:
-            return mitigation.signal(Evidence(drawn.reward, sigma, feedback), expected)
-
-        def prefer(mu: Array, sigma: Array) -> Array:
-            return mitigation.score(mu[:, None], sigma[:, None], alone, expected)[:, 0]
+        def score_fn(mu: Array, sigma_m: Array) -> Array:
+            return mitigation.score(mu, sigma_m, feedback, expected, one_action=True)
 
         mask = (jax.random.uniform(mask_key, (agent.batch, agent.members)) < agent.bootstrap).astype(jnp.float32)
-        batch = Batch(drawn.observation, drawn.action, drawn.following, drawn.terminated, mask)
-        state, watched = agent.update(state, batch, judge, prefer, learn_key)
-        return state, watched.loss
+        batch = Transitions(drawn.observation, drawn.action, drawn.next_observation, drawn.terminated, mask)
+        state, info = agent.update(state, batch, reward_fn, score_fn, learn_key)
+        return state, info.loss
 
-    state, losses = lax.scan(one, state, jax.random.split(key, count))
+    state, losses = lax.scan(update, state, jax.random.split(key, count))
     return state, buffer, jnp.isfinite(losses).all()

@@ -1,0 +1,141 @@
+"""Checks of what a filter does to a log: each returns a finding, or None."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from uard.diagnosis.case import Case, FilterOutcome, mostly, pairs, rescaled, share_kept
+from uard.diagnosis.finding import Finding, percent
+from uard.diagnosis.finding import rows as rows_text
+
+
+def by_setting(case: Case, check: Callable[[Case, FilterOutcome], Finding | None]) -> Finding | None:
+    """Look at the filter that is going to be used; a trap of the printed one alone is a note."""
+    found = check(case, case.mine)
+    if found is not None:
+        if case.mine.name == case.advised.name:
+            return found
+        good = check(case, case.advised) is None
+        verdict = "avoids" if good else "does not avoid"
+        return replace(found, remedy=f"{found.remedy} On this log named('uard') {verdict} it.")
+    found = check(case, case.printed)
+    if found is None:
+        return None
+    return replace(
+        found,
+        severity="note",
+        consequence=f"With the filter as printed: {found.consequence}",
+        remedy=f"Nothing to do: {case.mine.name} avoids it on this log. {found.remedy}",
+    )
+
+
+def smaller_penalties(case: Case, outcome: FilterOutcome) -> Finding | None:
+    """Penalties become smaller than reward and raters say."""
+    r, mean, believed = case.reward, case.feedback.mean, outcome.believed
+    gain = np.where(case.rated & (r < 0), believed - np.maximum(r, mean), 0.0)
+    lost = (gain > 0.05 * case.unit) & (gain > 0.1 * np.abs(r))
+    if not lost.any():
+        return None
+    i, j = pairs(np.flatnonzero(lost), np.flatnonzero(case.rated))
+    worse = (r[i] < r[j]) & (mean[i] < mean[j])
+    turned = worse & (believed[i] > believed[j])
+    share = float(turned.sum() / max(int(worse.sum()), 1))
+    worst = int(np.argmax(np.where(lost, gain, 0.0)))
+    return Finding(
+        "smaller-penalties",
+        "danger" if turned.any() else "warning",
+        f"{outcome.name} makes {int(lost.sum())} of {int((case.rated & (r < 0)).sum())} rated penalties smaller than reward and mean "
+        f"rating say; most of all in {case.place(worst)}: {r[worst]:.3g} becomes {believed[worst]:.3g}. In {percent(share)} of their "
+        "pairs with a step that both reward and raters call better, the penalty is paid more.",
+        "w < 1 draws a negative reward up to an anchor of zero: the agent is let off exactly where people disagree about how "
+        "bad it was, and enters a hazard that it would avoid without a filter.",
+        "Draw rewards towards the lowest rating, anchor='lowest', not towards zero.",
+        {"penalties": float(lost.sum()), "largest_gain": float(gain[worst]), "turned": share},
+    )
+
+
+def origin_and_unit(case: Case, outcome: FilterOutcome) -> Finding | None:
+    """What is learned depends on where zero is, or on the unit."""
+    rated = np.flatnonzero(case.rated)
+    i, j = pairs(rated, rated)
+    apart = np.abs(case.reward[i] - case.reward[j]) > 0.1 * case.unit
+    i, j = i[apart], j[apart]
+    if not i.size:
+        return None
+    before = outcome.believed[i] - outcome.believed[j]
+    flips: dict[str, float] = {}
+    for name, shift, factor in (("shift", -10.0, 1.0), ("scale", 0.0, 0.1)):
+        moved = rescaled(case, outcome.method, shift, factor)
+        after = (moved[i] - moved[j]) / factor
+        tiny = 1e-9 * case.unit
+        flips[name] = float(((before * after < 0) & (np.abs(before) > tiny) & (np.abs(after) > tiny)).mean())
+    if max(flips.values()) < 0.01:
+        return None
+    return Finding(
+        "origin-and-unit",
+        "danger" if max(flips.values()) >= 0.1 else "warning",
+        f"If 10 is subtracted from all rewards and ratings, {outcome.name} turns the order of {percent(flips['shift'])} of pairs of "
+        f"rows; if all are multiplied by 0.1, of {percent(flips['scale'])} ({i.size} pairs that differ by over a tenth of a unit).",
+        "What the agent prefers then depends on where zero is and on the unit, which carry no meaning: reward "
+        "normalisation, another bonus or a rescaled model changes what it learns.",
+        "anchor='lowest' makes the filter indifferent to a shift, standardise=True to the unit.",
+        flips,
+    )
+
+
+def lie_still_pays(case: Case, outcome: FilterOutcome) -> Finding | None:
+    """A contested reward is still paid far above its mean rating."""
+    gap, far = case.gap(), case.far()
+    contested = far & (gap > 0) & ~case.agreed(gap) & case.together
+    if not contested.any() or mostly(far, case.rated):
+        return None
+    extra = (outcome.believed - case.feedback.mean)[contested]
+    if extra.mean() < 0.25 * case.unit:
+        return None
+    worst = int(np.argmax(np.where(contested, outcome.believed - case.feedback.mean, -np.inf)))
+    kept = share_kept(case, outcome, contested)
+    return Finding(
+        "lie-still-pays",
+        "danger" if extra.mean() > case.unit else "warning",
+        f"In {rows_text(int(contested.sum()))} raters are divided about a reward that is more than a unit ({case.unit:.3g}) above their mean. "
+        f"{outcome.name} still pays {extra.mean():+.3g} more than the mean rating there ({percent(kept)} of the difference); most of "
+        f"all in {case.place(worst)}: reward {case.reward[worst]:.3g}, ratings {case.feedback.mean[worst]:.3g} ± "
+        f"{case.feedback.sd[worst]:.2g}, paid {outcome.believed[worst]:.3g}.",
+        "The discount is too small to change what is best: the agent goes where the reward lies, only with a smaller bonus.",
+        "Let lambda rise where disagreement stands out (kappa > 0) and draw rewards towards the lowest rating.",
+        {"rows": float(contested.sum()), "overpaid": float(extra.mean()), "kept": kept},
+    )
+
+
+def saturated(case: Case, outcome: FilterOutcome) -> Finding | None:
+    """Nothing is believed, or everything."""
+    if case.rated.sum() < 10:
+        return None
+    low, middle, high = np.quantile(outcome.weight[case.rated], [0.05, 0.5, 0.95])
+    disagreement = float(np.quantile(case.feedback.sd[case.rated], 0.95) / case.unit)
+    numbers = {"q05": float(low), "median": float(middle), "q95": float(high), "sigma_h_q95_in_units": disagreement}
+    spoken = f"{outcome.name}: weights of rated rows {low:.3g} (5 %), {middle:.3g} (median), {high:.3g} (95 %)"
+    if high < 0.1:
+        return Finding(
+            "saturated-weights",
+            "danger",
+            f"{spoken}: nothing is believed.",
+            "The agent learns from the anchor alone; honest steps are discounted like lies, and with an anchor of zero "
+            "there is nothing left to learn.",
+            "Measure sigmas in units of the reward (standardise=True), or lower lam.",
+            numbers,
+        )
+    if low > 0.9 and disagreement > 0.5:
+        return Finding(
+            "saturated-weights",
+            "warning",
+            f"{spoken}: everything is believed, though raters disagree by up to {disagreement:.2g} units (95 % of rows).",
+            "The filter does nothing: it costs ratings and protects no more than the raw reward.",
+            "Measure sigmas in units of the reward (standardise=True), or raise lam. If all rows are disagreed upon alike, "
+            "no filter can tell them apart: give raters clearer instructions.",
+            numbers,
+        )
+    return None

@@ -1,0 +1,100 @@
+"""What the doctor finds, as data and as text."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+Severity = Literal["danger", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("danger", "warning", "note")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A trap that applies.
+
+    Attributes:
+        code: Its name; see ``CODES``.
+        severity: ``danger``: training goes wrong; ``warning``: it may; ``note``: it would with another setting.
+        evidence: What in the log shows it, in numbers.
+        consequence: What it would do to training.
+        remedy: What avoids it.
+        numbers: The numbers of the evidence, by name.
+    """
+
+    code: str
+    severity: Severity
+    evidence: str
+    consequence: str
+    remedy: str
+    numbers: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What the doctor found.
+
+    Attributes:
+        source: Which log.
+        mitigation: The filter that is going to be used.
+        rows: Rows of the log.
+        raters: Names of the annotators.
+        rated: Share of rows that somebody rated, in [0, 1].
+        agreement: Krippendorff's alpha (interval metric) of the annotators, <= 1; None where it is not defined.
+        calibration: How well sigma predicts |reward - true reward| on rated rows; None without a true reward. For
+            ``sigma_h`` alone, ``sigma_h_with_proxy`` (the reward counted as one more rater) and ``sigma_m`` (if
+            logged): ``spearman`` and, where there are lies and honest rows, ``auroc`` (a lie is off by over a unit).
+        findings: The worst first.
+    """
+
+    source: str
+    mitigation: str
+    rows: int
+    raters: tuple[str, ...]
+    rated: float
+    agreement: float | None
+    calibration: Mapping[str, Mapping[str, float]] | None
+    findings: tuple[Finding, ...]
+
+    def count(self, severity: Severity) -> int:
+        """Return how many findings are of this severity."""
+        return sum(f.severity == severity for f in self.findings)
+
+    def as_data(self) -> dict[str, Any]:
+        """Return everything as plain data that JSON can hold."""
+        return asdict(self) | {"raters": list(self.raters), "findings": [asdict(f) for f in self.findings]}
+
+    def __str__(self) -> str:
+        """Return the whole diagnosis as text, 100 columns wide."""
+        who = f"{len(self.raters)} rater{'s' * (len(self.raters) != 1)}"
+        names = f" ({', '.join(self.raters)})" if 0 < len(self.raters) <= 8 else ""
+        lines = [f"{self.source}: {self.rows} rows, {who}{names}, {percent(self.rated)} of rows rated"]
+        alpha = "not defined (fewer than two ratings of anything, or all ratings equal)"
+        if self.agreement is not None:
+            alpha = f"{self.agreement:.3f} (1 perfect, 0 chance; below 0.667 by custom too low to rely on)"
+        lines.append(f"agreement   Krippendorff's alpha {alpha}")
+        for sigma, values in (self.calibration or {}).items():
+            shown = ", ".join(f"{name} {value:.3f}" for name, value in values.items())
+            lines.append(f"calibration {sigma.replace('_with_proxy', ' with the reward as a rater')}: {shown}")
+        lines.append(f"filter      {self.mitigation}")
+        for f in self.findings:
+            lines += ["", f"{f.severity.upper():8}{f.code}"]
+            for name in ("evidence", "consequence", "remedy"):
+                lines.append(
+                    textwrap.fill(getattr(f, name), 100, initial_indent=f"  {name:12}", subsequent_indent=14 * " ")
+                )
+        found = ", ".join(f"{self.count(s)} {s}" for s in SEVERITIES if self.count(s))
+        return "\n".join([*lines, "", f"findings: {found or 'none'}"])
+
+
+def percent(share: float) -> str:
+    """Return a share in [0, 1] as text."""
+    text = f"{100 * share:.1f}"
+    return f"{100 * share:.2g} %" if text == "0.0" and share > 0 else f"{text.removesuffix('.0')} %"
+
+
+def rows(n: int) -> str:
+    """Return a number of rows as text."""
+    return f"{n} row" + "s" * (n != 1)

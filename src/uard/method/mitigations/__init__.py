@@ -1,0 +1,28 @@
+"""Mitigations: what reward is learned from, how actions are scored, which score the backup follows."""
+
+from uard.method.feedback import ByRater, Feedback
+from uard.method.mitigations.baselines import RatedReward, Raw, Screening
+from uard.method.mitigations.discounting import RewardDiscounting, uard, uard_paper
+from uard.method.mitigations.panel_statistics import PanelStatistics
+from uard.method.mitigations.protocol import Backup, Evidence, Explanation, LearningSignal, Mitigation
+from uard.method.mitigations.registry import NAMED, is_mitigation, named
+
+__all__ = [
+    "NAMED",
+    "Backup",
+    "ByRater",
+    "Evidence",
+    "Explanation",
+    "Feedback",
+    "LearningSignal",
+    "Mitigation",
+    "PanelStatistics",
+    "RatedReward",
+    "Raw",
+    "RewardDiscounting",
+    "Screening",
+    "is_mitigation",
+    "named",
+    "uard",
+    "uard_paper",
+]

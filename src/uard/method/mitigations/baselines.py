@@ -1,0 +1,103 @@
+"""Mitigations to compare with: the raw reward, a statistic of the ratings, leaving out what is disputed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+from uard import _checks
+from uard.method import uncertainty
+from uard.method.arrays import Array, namespace, where
+from uard.method.feedback import Feedback
+from uard.method.mitigations import panel_statistics
+from uard.method.mitigations.panel_statistics import PanelStatistics
+from uard.method.mitigations.protocol import Evidence, LearningSignal, Mitigation
+from uard.method.weights import discount
+
+
+def shrink_unrated(reward: Array, lowest: Array, weight: Array) -> Array:
+    """Shrink a reward that nobody has rated towards what a step is usually worth at least."""
+    return discount(reward, weight, lowest)
+
+
+@dataclass(frozen=True)
+class Raw(Mitigation):
+    """Learn from the observed reward: no mitigation."""
+
+    reads_feedback: ClassVar[bool] = False
+
+    def signal(self, evidence: Evidence, statistics: Any) -> LearningSignal:
+        """Return the observed reward."""
+        return LearningSignal(evidence.reward, 1.0)
+
+
+Statistic = Literal["mean", "lowest", "bound"]
+
+
+@dataclass(frozen=True)
+class RatedReward(Mitigation):
+    """Learn from a statistic of the ratings (its running mean) instead of the observed reward.
+
+    Attributes:
+        statistic: ``mean`` or ``lowest`` of the ratings, or ``bound``: mean - k sigma over the ratings and the
+            observed reward.
+        k: Deviations below the mean for ``bound``, >= 0.
+        unrated_weight: How far the observed reward is believed where nobody has rated it yet, in [0, 1]; 1 takes it
+            as it is.
+    """
+
+    statistic: Statistic = "mean"
+    k: float = 1.0
+    unrated_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        _checks.choose("statistic", self.statistic, ("mean", "lowest", "bound"))
+        _checks.number("k", self.k, low=0)
+        _checks.number("unrated_weight", self.unrated_weight, low=0, high=1)
+
+    def fit(self, feedback: Feedback, rated: Array) -> PanelStatistics:
+        """Measure ``PanelStatistics``."""
+        return panel_statistics.fit(feedback, rated, proxy_is_rater=False)
+
+    def signal(self, evidence: Evidence, statistics: PanelStatistics) -> LearningSignal:
+        """Return the statistic."""
+        f, r = evidence.feedback, evidence.reward
+        if self.statistic == "mean":
+            rated = f.mean
+        elif self.statistic == "lowest":
+            rated = f.lowest
+        else:
+            mean = (f.raters * f.mean + r) / (f.raters + 1.0)
+            rated = mean - self.k * uncertainty.with_proxy(f.mean, f.sd, r, f.raters)
+        return LearningSignal(where(f.count > 0, rated, shrink_unrated(r, statistics.lowest, self.unrated_weight)), 1.0)
+
+
+@dataclass(frozen=True)
+class Screening(Mitigation):
+    """Leave out of learning every step on which the raters disagree more than a threshold.
+
+    The hard form of the filter: w in {0, 1}, and a step with w = 0 is skipped.
+
+    Attributes:
+        limit: Largest sigma_h (proxy counted as a rater) that is still learned from, in units of the reward's
+            running scale, > 0.
+    """
+
+    limit: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Check the parameter."""
+        _checks.number("limit", self.limit, low=0, open_low=True)
+
+    def fit(self, feedback: Feedback, rated: Array) -> PanelStatistics:
+        """Measure the reward's scale."""
+        return panel_statistics.fit(feedback, rated, proxy_is_rater=True)
+
+    def signal(self, evidence: Evidence, statistics: PanelStatistics) -> LearningSignal:
+        """Return the observed reward, and sample weight 0 where it is screened out."""
+        f, r = evidence.feedback, evidence.reward
+        sigma = uncertainty.with_proxy(f.mean, f.sd, r, f.raters)
+        out = (f.count > 0) & (sigma > self.limit * statistics.scale)
+        one = namespace(sigma).ones_like(sigma)
+        return LearningSignal(r, where(out, 0.0 * one, one))

@@ -1,0 +1,48 @@
+"""Mitigations by name: ours, and those of installed packages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from uard import plugins
+from uard.method.mitigations.baselines import RatedReward, Raw, Screening
+from uard.method.mitigations.discounting import uard, uard_paper
+from uard.method.mitigations.protocol import Mitigation
+
+NAMED: dict[str, Callable[..., Mitigation]] = {
+    "raw": Raw,
+    "mean-of-annotations": RatedReward,
+    "worst-of-annotations": partial(RatedReward, statistic="lowest"),
+    "lcb": partial(RatedReward, statistic="bound"),
+    "screening": Screening,
+    "uard": uard,
+    "uard-paper": uard_paper,
+    "uard-consistent": partial(uard_paper, backup="consistent"),
+    "uard-operator": partial(uard_paper, acts_on="reward"),
+    "uard-lite": partial(uard_paper, beta=0.0),
+    "human-only": partial(uard_paper, alpha=0.0),
+    "no-discount": partial(uard_paper, lam=0.0),
+    "uard-exponential": partial(uard_paper, form="exponential"),
+    "uard-linear": partial(uard_paper, form="linear"),
+    "uard-certainty-equivalent": partial(uard_paper, form="certainty-equivalent"),
+    "uard-wiener": partial(uard_paper, form="wiener"),
+}
+
+
+def named(name: str, **parameters: Any) -> Mitigation:
+    """Return the mitigation of that name, ours or a plugin's (``uard.plugins``), with some parameters changed.
+
+    Raises:
+        UnknownNameError: with the nearest name.
+        PluginError: a plugin that cannot be used.
+    """
+    if name in NAMED:
+        return NAMED[name](**parameters)
+    return plugins.pick("mitigation", name, NAMED, [*NAMED]).load(is_mitigation)(**parameters)
+
+
+def is_mitigation(value: object) -> bool:
+    """Whether ``value`` has what a mitigation has."""
+    return isinstance(value, Mitigation)
