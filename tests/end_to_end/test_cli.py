@@ -118,7 +118,7 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
         ),
         ("run BoatRace --noise-fraction 0.3", "noise_fraction = 0.3: must be left out where no trap pays"),
         ("run --agent dqn --feedback tabel", "feedback = 'tabel': must be one of *did you mean 'table'?"),
-        ("run --feedback model", "feedback = RatingModel(*none for a tabular agent"),
+        ("run --feedback model", "rating_model = RatingModel(*none for a tabular agent"),
         ("run --agent dqn --set-agent batch=0", "batch = 0: must be a whole number in [1, 4096]"),
         ("reproduce grid-dep", "study = 'grid-dep': must be one of *did you mean 'grid-deep'?"),
         ("run --panel mian", "panel = 'mian': must be one of *did you mean 'main'?"),

@@ -117,7 +117,7 @@ def test_the_study_is_published_and_shown():
         "sunrise": (sunrise(3, **OFF), Raw()),
     }
     rows = tuple(
-        row(Cell(WHERE, mitigation, agent, steps=256, feedback=SMALL, rated=0.1 * i), agent=name, critics="3")
+        row(Cell(WHERE, mitigation, agent, steps=256, rating_model=SMALL, rated=0.1 * i), agent=name, critics="3")
         for i, (name, (agent, mitigation)) in enumerate(agents.items())
     )
     study = Study(locomotion.DISTORTION, "t", "G12", rows, derive=derive.reactions)

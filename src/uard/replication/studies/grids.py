@@ -34,7 +34,7 @@ def scale(trap_reward: float = 4.0) -> tuple[Row, ...]:
             Cell(paper_grid(size, trap_reward), mitigation, agent, as_panel(panel)),
             agent=label,
             size=size,
-            panel=as_panel(panel),
+            panel=panel,
         )
         for size in SIZES
         for panel in PANELS
@@ -49,7 +49,7 @@ def table3() -> tuple[Row, ...]:
             Cell(paper_grid(10, horizon=t), mitigation, agent, as_panel(panel)),
             agent=label,
             horizon=t,
-            panel=as_panel(panel),
+            panel=panel,
         )
         for t in (100, 80)
         for panel in PANELS
@@ -66,7 +66,7 @@ def table4() -> tuple[Row, ...]:
         ("random walk", WALKER, RAW),
     )
     return tuple(
-        row(Cell(paper_grid(6), mitigation, agent, as_panel(panel)), agent=label, panel=as_panel(panel))
+        row(Cell(paper_grid(6), mitigation, agent, as_panel(panel)), agent=label, panel=panel)
         for panel in PANELS
         for label, agent, mitigation in agents
     )
@@ -140,7 +140,7 @@ def uncertainty() -> tuple[Row, ...]:
         row(
             Cell(paper_grid(6), named(name), agent, as_panel(panel), snapshots=50),
             agent=name,
-            panel=as_panel(panel),
+            panel=panel,
             heads=heads,
         )
         for panel in PANELS
