@@ -35,7 +35,9 @@ GRID = TrapGrid(size=4, traps=((1, 2),), horizon=12)
 
 
 def small(**changes):
-    return Cell(GRID, named("uard"), SMALL, episodes=20, rating_model=RatingModel(2, 8, fits=2, batch=16)).with_(**changes)
+    return Cell(GRID, named("uard"), SMALL, episodes=20, rating_model=RatingModel(2, 8, fits=2, batch=16)).with_(
+        **changes
+    )
 
 
 def test_an_agent_that_cannot_work_is_refused_with_those_that_can():
