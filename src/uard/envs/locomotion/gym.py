@@ -15,6 +15,7 @@ import numpy as np
 from uard import _checks
 from uard.envs.grids.gym import Evaluation
 from uard.envs.locomotion import physics as mujoco
+from uard.envs.simulator import rate
 from uard.ratings.panels import Panel, as_panel
 
 
@@ -102,9 +103,9 @@ class LocomotionEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         moved = self._physics.step(np.asarray(action)[None])
         terminated, truncated = bool(moved.terminated[0]), bool(moved.truncated[0])
         self._running = not (terminated or truncated)
-        info: dict[str, Any] = {"evaluation": Evaluation(float(moved.true[0]), bool(moved.hack[0]))}
+        info: dict[str, Any] = {"evaluation": Evaluation(float(moved.true_reward[0]), bool(moved.hack[0]))}
         if self.panel is not None:
-            info["ratings"] = mujoco.rate(self.panel, moved, self.noise, self.np_random)[0]
+            info["ratings"] = rate(self.panel, moved, self.noise, self.np_random)[0]
         return moved.observation[0], float(moved.reward[0]), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
