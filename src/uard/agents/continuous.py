@@ -24,8 +24,8 @@ from jax import Array, lax
 
 from uard import _checks
 from uard.agents import networks
-from uard.agents.base import Agent, Family
 from uard.agents.actor_critic import LOG_TEMPERATURES, Trained, gradient_similarity, polyak, temperature_loss
+from uard.agents.base import Agent, Family
 from uard.agents.heads import HALF_LOG_TAU, Normal
 from uard.agents.networks import Ensemble, Layer, Network, Weights
 from uard.agents.off_policy import RewardFn, Transitions, UpdateInfo

@@ -95,4 +95,4 @@ class OffPolicy(Agent):
         backup: Backup,
         key: Array,
     ) -> tuple[Any, UpdateInfo]:
-        """Learn from one batch; ``score_fn`` scores the observations after its steps, ``score_fn_here`` those before."""
+        """Learn from a batch; ``score_fn`` scores the observations after its steps, ``score_fn_here`` those before."""

@@ -46,6 +46,7 @@ def own() -> dict[str, type[Command]]:
     from uard.cli.doctor import Doctor
     from uard.cli.leaderboard import Leaderboard
     from uard.cli.list import List
+    from uard.cli.migrate import Migrate
     from uard.cli.reproduce import Reproduce
     from uard.cli.run import Run
     from uard.cli.status import Status
@@ -59,6 +60,7 @@ def own() -> dict[str, type[Command]]:
         "status": Status,
         "compare": Compare,
         "list": List,
+        "migrate": Migrate,
     }
 
 

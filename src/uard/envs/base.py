@@ -1,7 +1,7 @@
 """What the configuration of an environment is: a frozen dataclass of one of three kinds.
 
-The kind says what an agent can be trained with (``uard.training.trainers``): tables, a compiled world, or a simulator that
-runs on the host.
+The kind says which agents can be trained in it, and how (``uard.lab.execution.trainers``): tables, a compiled world, or
+a simulator that runs on the host.
 """
 
 from __future__ import annotations

@@ -2,50 +2,48 @@
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
-import json
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
-import numpy as np
-
 from uard import _checks
+from uard.agents.base import Agent
 from uard.agents.tabular import QLearning
-from uard.envs.base import CompiledEnvironment, SimulatedEnvironment
+from uard.envs.base import Environment
 from uard.envs.grids.trapgrid import TrapGrid
-from uard.lab import registry as names
+from uard.lab import registry
+from uard.lab.config import key_of, plain, settled
+from uard.lab.execution.trainers import Trainer
 from uard.method.mitigations import Mitigation, Raw
 from uard.ratings.panels import MAIN, Panel
 from uard.training.feedback.rating_model import RatingModel
 from uard.training.feedback.transition_model import QUERIES, TransitionModel
 
-# Raise this when training code changes what a cell means: old results are then not found, never mixed in.
-RESULTS = 2
-STEPS = 1_000_000
-LATER = {"later": True}  # of a field that older results do not know; at its default it is no part of a key
+EPISODES, STEPS = 500, 1_000_000
+# Of a mitigation that asks nobody, whatever was said of its raters.
+_UNASKED: dict[str, Any] = {"panel": MAIN, "noise": 0.0, "rated": 1.0, "rating_model": None, "query": "random"}
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One environment, panel, agent and mitigation, trained for some episodes.
+    """One environment, panel, agent and mitigation, trained for some episodes or steps.
 
     Attributes:
-        environment: Where it learns: an ``uard.envs.base.Spec``, or a ``Locomotion``.
+        environment: Where it learns.
         mitigation: What the agent does about a reward that may lie.
         agent: The learner.
-        panel: Who rates. Irrelevant, and therefore ignored, for a mitigation that reads no ratings.
+        panel: Who rates. Irrelevant, and therefore ignored, for a mitigation that reads no ratings; so are ``noise``,
+            ``rated``, ``rating_model`` and ``query``.
         noise: Standard deviation of extra noise on every rater, in reward units.
         rated: Fraction of steps that are rated, in [0, 1].
-        episodes: Training episodes, >= 1; ignored for a ``Locomotion``.
-        ddof: Of the annotators' deviation.
+        episodes: Training episodes, >= 1; ignored on a simulator.
+        ddof: Of the raters' deviation, 0 or 1.
         snapshots: Tables kept along the way, for the uncertainty curves; tabular agents only.
-        rating_model: How a deep agent knows of ratings: a model of them, or running means per state-action if None (which a
-            tabular agent always has). For a ``Locomotion`` always a model of transitions.
-        steps: Environment steps, for a ``Locomotion`` only; 1 000 000 if None.
+        rating_model: How a deep agent knows of ratings: a model of them, or running means per state-action if None
+            (which a tabular agent always has). On a simulator always a model of transitions.
+        steps: Environment steps, on a simulator only; 1 000 000 if None.
         query: Which steps are rated: ``random``, or half of them where the model of ratings knows least (``doubtful``;
-            for a ``Locomotion`` only).
+            on a simulator only).
     """
 
     environment: Any = field(default_factory=TrapGrid)
@@ -54,135 +52,97 @@ class Cell:
     panel: Panel = MAIN
     noise: float = 0.0
     rated: float = 1.0
-    episodes: int = 500
+    episodes: int = EPISODES
     ddof: int = 0
     snapshots: int = 0
-    rating_model: RatingModel | TransitionModel | None = field(default=None, metadata=LATER)
-    steps: int | None = field(default=None, metadata=LATER)
-    query: str = field(default="random", metadata=LATER)
+    rating_model: RatingModel | TransitionModel | None = None
+    steps: int | None = None
+    query: str = "random"
 
     def __post_init__(self) -> None:
-        """Check everything; forget what cannot matter.
+        """Check everything; bring what means the same to one form, and forget what cannot matter.
 
         Raises:
             InvalidValueError: a field out of range, or an agent that cannot work in the environment, with those that
                 can.
         """
-        if not isinstance(self.panel, Panel):
-            raise _checks.InvalidValueError("panel", self.panel, "a Panel (see uard.ratings.panels.PANELS)")
+        for name, kind in _PARTS.items():
+            self._put(name, _part(name, getattr(self, name), kind))
+        self._check_numbers()
+        trainer = registry.trainer(self.agent, self.environment)
+        self._settle_budget(trainer)
+        self._settle_feedback(trainer)
+        if not self.mitigation.reads_feedback:
+            for name, value in _UNASKED.items():
+                self._put(name, value)
+
+    def _put(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    def _check_numbers(self) -> None:
         _checks.number("noise", self.noise, low=0)
         _checks.number("rated", self.rated, low=0, high=1)
         _checks.whole("episodes", self.episodes, low=1, high=1_000_000)
         _checks.whole("ddof", self.ddof, low=0, high=1)
         _checks.whole("snapshots", self.snapshots, low=0, high=1000)
-        _checks.choose("query", self.query, QUERIES)
-        for name, kind in (
-            ("environment", CompiledEnvironment | SimulatedEnvironment),
-            ("mitigation", Mitigation),
-            ("agent", names.Agent),
-        ):
-            value = getattr(self, name)
-            if not isinstance(value, kind) or not _checks.is_frozen(value):
-                raise _checks.InvalidValueError(name, value, f"a frozen dataclass that is {_an(kind)}")
-            object.__setattr__(self, name, _settled(name, value))
-        names.check_pair(self.agent, self.environment)
-        physical = isinstance(self.environment, SimulatedEnvironment)
-        if physical:
-            _checks.whole("steps", STEPS if self.steps is None else self.steps, low=1, high=10**12)
-            object.__setattr__(self, "steps", int(STEPS if self.steps is None else self.steps))
-            object.__setattr__(self, "episodes", 500)
-            if self.rating_model is None:
-                object.__setattr__(self, "rating_model", TransitionModel())
+        for name in ("noise", "rated"):
+            self._put(name, settled(name, float(getattr(self, name))))
+        for name in ("episodes", "ddof", "snapshots"):
+            self._put(name, int(getattr(self, name)))
+
+    def _settle_budget(self, trainer: Trainer) -> None:
+        if trainer.budget == "steps":
+            steps = STEPS if self.steps is None else self.steps
+            _checks.whole("steps", steps, low=1, high=10**12)
+            self._put("steps", int(steps))
+            self._put("episodes", EPISODES)
         elif self.steps is not None:
-            raise _checks.InvalidValueError("steps", self.steps, "left out but for Hopper and Walker2d; see episodes")
-        elif self.query != "random":
-            raise _checks.InvalidValueError("query", self.query, "random but for Hopper and Walker2d")
-        if isinstance(self.agent, QLearning):
-            if self.rating_model is not None:
-                raise _checks.InvalidValueError(
-                    "rating_model", self.rating_model, "none for a tabular agent, which keeps tables"
-                )
-        elif self.snapshots:
+            raise _checks.InvalidValueError("steps", self.steps, "left out but on a simulator; see episodes")
+        if self.snapshots and not trainer.snapshots:
             raise _checks.InvalidValueError("snapshots", self.snapshots, "0 for an agent that keeps no tables")
-        if self.rating_model is not None:
-            wanted = TransitionModel if physical else RatingModel
-            if not isinstance(self.rating_model, wanted):
-                raise _checks.InvalidValueError("rating_model", self.rating_model, f"a {wanted.__name__} or none")
-            object.__setattr__(self, "rating_model", _settled("rating_model", self.rating_model))
-        if not self.mitigation.reads_feedback:
-            unheard = {"panel": MAIN, "noise": 0.0, "rated": 1.0, "rating_model": None, "query": "random"}
-            for name, value in unheard.items():
-                object.__setattr__(self, name, value)
-        for name, kind in (("noise", float), ("rated", float), ("episodes", int), ("ddof", int), ("snapshots", int)):
-            object.__setattr__(self, name, kind(getattr(self, name)))
+
+    def _settle_feedback(self, trainer: Trainer) -> None:
+        model = self.rating_model
+        kinds = {type(m) for m in trainer.rating_models.values() if m is not None}
+        if model is None and "table" not in trainer.rating_models:
+            model = trainer.usual_rating_model
+        elif model is not None and type(model) not in kinds:
+            allowed = " or ".join([*(f"a {kind.__name__}" for kind in kinds), "none"])
+            why = "" if kinds else " for a tabular agent, which keeps tables"
+            raise _checks.InvalidValueError("rating_model", model, f"{allowed}{why}")
+        self._put("rating_model", settled("rating_model", model))
+        if _checks.choose("query", self.query, QUERIES) not in trainer.queries:
+            raise _checks.InvalidValueError("query", self.query, f"{' or '.join(trainer.queries)} but on a simulator")
 
     def config(self) -> dict[str, Any]:
-        """Return the whole configuration as plain data."""
+        """Return the whole configuration as plain data; see ``uard.lab.config``."""
         return plain(self)
 
     @cached_property
+    def trainer(self) -> Trainer:
+        """Who trains it."""
+        return registry.trainer(self.agent, self.environment)
+
+    @cached_property
     def key(self) -> str:
-        """A name made of the whole configuration: equal cells have equal keys, and only they."""
-        text = json.dumps({"results": RESULTS, "cell": self.config()}, sort_keys=True, allow_nan=False)
-        return hashlib.sha256(text.encode()).hexdigest()[:32]
+        """A name made of the whole configuration and of how it is trained: equal cells have equal keys, only they do.
+
+        It has a new one when the version of that kind of training is raised, and none when a class is moved.
+        """
+        return key_of(self.config(), self.trainer.name, self.trainer.version)
 
     def with_(self, **changes: Any) -> Cell:
         """Return a copy with some fields changed."""
         return replace(self, **changes)
 
 
-def _an(kind: Any) -> str:
-    kinds = getattr(kind, "__args__", (kind,))
-    return "a " + " or a ".join(k.__name__ for k in kinds)
+_PARTS: dict[str, type] = {"environment": Environment, "mitigation": Mitigation, "agent": Agent, "panel": Panel}
 
 
-def _settled(name: str, value: Any) -> Any:
-    """Bring equal settings (2 and 2.0, 0.0 and -0.0, NumPy's numbers) to one form, so that their keys are equal.
-
-    Raises:
-        InvalidValueError: a setting that cannot be part of a key.
-    """
-    if _checks.is_frozen(value):
-        changes = {}
-        for f in _fields(type(value)):
-            old = getattr(value, f.name)
-            new = _settled(f"{name}.{f.name}", old)
-            if new is old and type(new) is not int:
-                continue
-            if f.type in (float, "float") and type(new) is int:
-                new = float(new)
-            if type(new) is not type(old) or repr(new) != repr(old):
-                changes[f.name] = new
-        return replace(value, **changes) if changes else value
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, tuple):
-        return tuple(_settled(f"{name}[{i}]", v) for i, v in enumerate(value))
-    if isinstance(value, float):
-        _checks.number(name, value)
-        return value if value else 0.0
-    if not (value is None or isinstance(value, bool | int | str)):
-        allowed = "a number, text, true, false, none, or a tuple or frozen dataclass of these"
+def _part(name: str, value: Any, kind: type) -> Any:
+    if not isinstance(value, kind) or not _checks.is_frozen(value):
+        hint = " (see uard.ratings.panels.PANELS)" if kind is Panel else ""
+        article = "an" if kind.__name__[0] in "AE" else "a"
+        allowed = f"a frozen dataclass that is {article} {kind.__name__}{hint}"
         raise _checks.InvalidValueError(name, value, allowed)
-    return value
-
-
-@cache
-def _fields(cls: type) -> tuple[dataclasses.Field[Any], ...]:
-    return dataclasses.fields(cls)
-
-
-def plain(value: Any) -> Any:
-    """Turn (nested) dataclasses into dictionaries that name their class; see ``LATER``."""
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        cls = type(value)
-        held = ((f, getattr(value, f.name)) for f in _fields(cls))
-        fields = {f.name: plain(v) for f, v in held if not (f.metadata.get("later") and v == f.default)}
-        return {"class": cls.__name__, **fields}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    return value
+    return settled(name, value)

@@ -10,20 +10,21 @@ from uard import _checks, plugins
 from uard._support.fields import changed
 from uard.agents import continuous
 from uard.agents.actor_critic import SoftActorCritic, edac
-from uard.agents.continuous import ContinuousActorCritic
+from uard.agents.base import Agent
 from uard.agents.networks import Ensemble, Network
-from uard.agents.off_policy import OffPolicy
-from uard.agents.policy import CPO, PPO, TRPO, PolicyGradient
+from uard.agents.policy import CPO, PPO, TRPO
 from uard.agents.tabular import QLearning
 from uard.agents.value import DeepQ
-from uard.envs.base import CompiledEnvironment, SimulatedEnvironment, TableEnvironment
+from uard.envs.base import Environment
 from uard.envs.classic.specs import Acrobot, CartPole
 from uard.envs.grids.gaming import AbsentSupervisor, BoatRace, TomatoWatering
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.envs.locomotion.physics import Locomotion, Posture, Vibration
+from uard.lab.execution.trainers import Trainer, trainer_of
 from uard.method import mitigations as mitigation
 from uard.method.abstention import Abstention
 from uard.training.feedback.rating_model import RatingModel
+from uard.training.feedback.transition_model import TransitionModel
 
 ENVIRONMENTS: dict[str, Any] = {
     "TrapGrid": TrapGrid(),
@@ -94,7 +95,6 @@ def continuous_agents(small: bool = False) -> dict[str, Any]:
     }
 
 
-Agent = QLearning | OffPolicy | PolicyGradient | ContinuousActorCritic
 CONTINUOUS: dict[str, Any] = continuous_agents()
 AGENTS: dict[str, Agent] = {
     "q-learning": QLearning(),
@@ -105,35 +105,30 @@ AGENTS: dict[str, Agent] = {
 
 def can_work(agent: Any, environment: Any) -> bool:
     """Whether an agent can work in an environment: tables need one that fits into them, motors a continuous agent."""
-    if isinstance(environment, Locomotion):
-        return isinstance(agent, PolicyGradient | ContinuousActorCritic)
-    if isinstance(agent, ContinuousActorCritic):
-        return False
-    return isinstance(environment, TableEnvironment) or not isinstance(agent, QLearning)
+    return trainer_of(agent, environment) is not None
 
 
-def check_pair(agent: Any, environment: Any) -> None:
-    """Refuse an agent that cannot work in an environment.
+def trainer(agent: Any, environment: Any) -> Trainer:
+    """Return who trains an agent in an environment.
 
     Raises:
-        InvalidValueError: with the names of those that can.
+        InvalidValueError: it cannot work there; with the names of those that can.
     """
-    if not can_work(agent, environment):
-        able = ", ".join(name for name, other in agents(environment).items() if can_work(other, environment))
-        if isinstance(environment, Locomotion):
-            why = "whose actions are continuous"
-        elif isinstance(agent, ContinuousActorCritic):
-            why = "whose actions are discrete"
-        else:
-            why = "which does not fit into tables"
-        raise _checks.InvalidValueError(
-            "agent", agent, f"one that can work in {type(environment).__name__}, {why}: {able}"
-        )
+    if (found := trainer_of(agent, environment)) is not None:
+        return found
+    able = ", ".join(name for name, other in agents(environment).items() if can_work(other, environment))
+    if environment.kind == "simulator":
+        why = "whose actions are continuous"
+    elif agent.family == "tabular":
+        why = "which does not fit into tables"
+    else:
+        why = "whose actions are discrete"
+    raise _checks.InvalidValueError("agent", agent, f"one that can work in {type(environment).__name__}, {why}: {able}")
 
 
-def agents(environment: Any) -> dict[str, Any]:
+def agents(environment: Any = None) -> dict[str, Any]:
     """Return the agents by name, as they are for an environment."""
-    return CONTINUOUS if isinstance(environment, Locomotion) else AGENTS
+    return CONTINUOUS if environment is not None and environment.kind == "simulator" else AGENTS
 
 
 OWN: dict[str, tuple[str, ...]] = {
@@ -142,7 +137,7 @@ OWN: dict[str, tuple[str, ...]] = {
     "mitigation": (*mitigation.NAMED,),
 }
 IS_ONE: dict[str, Callable[[Any], bool]] = {
-    "environment": lambda value: isinstance(value, CompiledEnvironment | SimulatedEnvironment),
+    "environment": lambda value: isinstance(value, Environment),
     "agent": lambda value: isinstance(value, Agent),
     "mitigation": mitigation.is_mitigation,
 }
@@ -163,18 +158,8 @@ def environment(name: str, changes: dict[str, Any]) -> Any:
     """Return an environment by name. A new size, unless more is said, brings its own traps, goal and horizon."""
     base = _of("environment", name, ENVIRONMENTS)
     if isinstance(base, TrapGrid) and changes.get("size", base.size) != base.size:
-        base = TrapGrid(trap_reward=base.trap_reward, legitimate=base.legitimate)
-        base = _bare(base)
+        base = base.resized(changes["size"])
     return changed(base, changes, "environment")
-
-
-def _bare(grid: TrapGrid) -> TrapGrid:
-    """Undo what the constructor filled in from the size."""
-    copy = object.__new__(TrapGrid)
-    for f in dataclasses.fields(TrapGrid):
-        keep = f.name not in ("traps", "goal", "horizon", "size")
-        object.__setattr__(copy, f.name, getattr(grid, f.name) if keep else f.default)
-    return copy
 
 
 def agent(name: str, changes: dict[str, Any], environment: Any = None) -> Agent:
@@ -188,12 +173,13 @@ def agent(name: str, changes: dict[str, Any], environment: Any = None) -> Agent:
     return changed(base, changes, "agent")
 
 
-def rating_model(name: str | None, of: Agent, environment: Any = None) -> RatingModel | None:
-    """Return how an agent knows of ratings: ``model`` (a deep agent's default) or ``table`` (a tabular one's)."""
-    if isinstance(environment, Locomotion):
-        if name not in (None, "model"):
-            raise _checks.InvalidValueError("feedback", name, "model, or left out: no step comes twice")
-        return None
+def rating_model(name: str | None, of: Agent, environment: Any) -> RatingModel | TransitionModel | None:
+    """Return how an agent knows of ratings in an environment: by its name, or as usual there.
+
+    Raises:
+        UnknownNameError: it cannot know of them in that way.
+    """
+    found = trainer(of, environment)
     if name is None:
-        return None if isinstance(of, QLearning) else RatingModel()
-    return RatingModel() if _checks.choose("feedback", name, ("model", "table")) == "model" else None
+        return found.usual_rating_model
+    return found.rating_models[_checks.choose("feedback", name, found.rating_models)]

@@ -5,10 +5,10 @@
 1 KB. Raising that bound makes the tabular program 20 times faster (0.4 to 8 million steps a second). Loops with matrix
 products are never compiled that way.
 
-*One thread.* XLA splits the sums of a matrix product among its threads, one per core that the process may use, and a sum
-that is split otherwise is rounded otherwise: PPO and TRPO gave other results on one core, on four and on sixteen. With
-one thread a result depends neither on the number of cores nor on whether a worker, which has one core, or the process
-itself trains. Many runs fill the cores, one process each.
+*One thread.* XLA splits the sums of a matrix product among its threads, one per core that the process may use, and a
+sum that is split otherwise is rounded otherwise: PPO and TRPO gave other results on one core, on four and on sixteen.
+With one thread a result depends neither on the number of cores nor on whether a worker, which has one core, or the
+process itself trains. Several runs fill the cores, a process each.
 """
 
 from __future__ import annotations

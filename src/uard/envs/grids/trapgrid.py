@@ -7,17 +7,13 @@ the own cell. The true reward of a trap is -1; the paper never states it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from uard import _checks
 from uard.envs.base import TableEnvironment
 from uard.envs.tables import HiddenTruth, Task
-
-if TYPE_CHECKING:
-    pass
 
 MOVES = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])  # up, down, left, right
 PAPER_TRAPS = {6: ((3, 3),), 8: ((3, 3), (5, 6)), 10: ((3, 3), (5, 6), (7, 4))}
@@ -83,6 +79,10 @@ class TrapGrid(TableEnvironment):
             put(self, name, float(getattr(self, name)))
         if not isinstance(self.legitimate, bool):
             raise _checks.InvalidValueError("legitimate", self.legitimate, "true or false")
+
+    def resized(self, size: int) -> TrapGrid:
+        """Return the same grid in another size, with that size's own traps, goal and horizon."""
+        return replace(self, size=size, traps=None, goal=None, horizon=None)
 
     @property
     def states(self) -> int:

@@ -9,8 +9,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-BEAT = 15.0  # seconds between two signs of life
-LEASE = 120.0  # seconds without one, after which a process that cannot be looked at is held for dead
+HEARTBEAT = 15.0  # seconds between two heartbeats
+LEASE = 120.0  # seconds without one, after which a process that cannot be looked up counts as dead
 
 _at_work: set[str] = set()  # tokens of owners in this process
 
@@ -23,7 +23,7 @@ class Owner:
         token: Random, so that no two are equal.
         host: Name of the machine, for people.
         place: Where ``pid`` and ``born`` mean something: one start of one kernel, one namespace of processes. Empty
-            where a process cannot be looked at.
+            where a process cannot be looked up.
         pid: Process id.
         born: When the process started, in the kernel's ticks: a later process with the same id has another one.
     """
@@ -43,14 +43,14 @@ class Owner:
         return owner
 
     def stop(self) -> None:
-        """Be dead from now on, for this process at least."""
+        """Count as dead from now on, for this process at least."""
         _at_work.discard(self.token)
 
     def alive(self, beat: float, now: float | None = None) -> bool:
-        """Whether it still runs: exactly if it is of this machine (Linux), by its last sign of life elsewhere.
+        """Whether it still runs: exactly if it is of this machine (Linux), by its last heartbeat elsewhere.
 
         Args:
-            beat: When it gave that sign, in seconds since 1970.
+            beat: When that was, in seconds since 1970.
             now: The time; that of this machine's clock if left out.
         """
         if self.place and self.place == _place():
@@ -60,7 +60,7 @@ class Owner:
         return (time.time() if now is None else now) - beat < LEASE
 
     def __str__(self) -> str:
-        """Name it as people do."""
+        """Return host and process id."""
         return f"{self.host}:{self.pid}"
 
 

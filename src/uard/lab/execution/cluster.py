@@ -8,7 +8,6 @@ is simply trained again.
 from __future__ import annotations
 
 import os
-import pickle
 import socket
 import subprocess
 import sys
@@ -17,14 +16,14 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from uard import _checks
-from uard.lab.execution import runner
-from uard.lab.execution.runner import Answer, Claim, Job, Outcomes
+from uard.lab.execution.batching import Job
+from uard.lab.execution.training import Answer, attempt, attempt_packed, packed
+from uard.lab.execution.workers import Claim, Outcomes
 
 RETRIES = 5  # nodes that may be lost under one batch before it counts as failed
 AHEAD = 2  # batches handed out per slot of the cluster, so that none waits for the driver
@@ -77,7 +76,7 @@ class Ray:
         with _connected(self.address) as ray:
             yield from self._train(ray, queue, claim, local)
         for batch in local:
-            yield batch, runner._attempt(lambda batch=batch: (batch, folder))
+            yield batch, attempt(batch, folder)
 
     def _train(self, ray: Any, queue: list[list[Job]], claim: Claim, local: list[list[Job]]) -> Outcomes:
         """Train what can be pickled; the rest is left in ``local``."""
@@ -92,7 +91,7 @@ class Ray:
         def launch() -> None:
             room = max(AHEAD * self._slots(ray), 1)
             while len(flying) < room and (batch := next(waiting, None)) is not None:
-                data = runner._packed((batch, self.checkpoints))
+                data = packed(batch, self.checkpoints)
                 if data is None:
                     local.append(batch)
                 else:
@@ -120,12 +119,11 @@ class Ray:
 
 def _there(data: bytes, versions: dict[str, str | None]) -> Answer:
     """Train a batch, on whichever node this runs."""
-    os.environ.setdefault("NPROC", "1")  # JAX reads it when it starts: one thread, for a task has one CPU
     other = {p: here for p in versions if (here := _version(p)) != versions[p]}
     if other:
         driver = {p: versions[p] for p in other}
         return f"this node has {other}, the driver {driver}: install the same on every node"
-    return runner._attempt(partial(pickle.loads, data))
+    return attempt_packed(data)
 
 
 def _version(package: str) -> str | None:

@@ -18,11 +18,12 @@ from urllib.parse import quote
 
 from uard import __version__
 from uard.lab.cell import Cell
+from uard.lab.config import FORMAT
 from uard.lab.execution.claims import Owner
 from uard.lab.result import CorruptResultError, Result, digest
 
-# Tables may be added, never changed: a store of an older version of the same results is opened as it is.
-_TABLES = {
+# The file's ``user_version`` is the format of its keys; what is of an older one goes through ``uard migrate``.
+TABLES = {
     "cells": "(key text primary key, config text not null)",
     "results": """(
         key text not null references cells (key), seed integer not null, data blob not null, checksum text not null,
@@ -46,6 +47,7 @@ _TABLES = {
 }
 # Whoever asks what is finished need not walk past the bytes.
 _INDEX = "create index if not exists results_finished on results (key, seed, created);"
+OLDEST = 2  # format that can be migrated
 _COLUMNS = {"key", "seed", "data", "checksum", "metrics", "version", "created"}  # of results
 
 
@@ -69,13 +71,13 @@ class Stored:
 
 
 @dataclass(frozen=True)
-class Run:
+class WorkerRun:
     """One process's work on a store, as it last said itself.
 
     Attributes:
         owner: The process.
         began: When it began, in seconds since 1970.
-        beat: Its last sign of life.
+        beat: Its last heartbeat.
         total: Seeds that were missing when it began.
         done: Those of them that are finished or failed, whoever trained them.
         failed: Those that failed.
@@ -131,7 +133,7 @@ class Store:
 
         Args:
             path: The file.
-            readonly: Only look: the file must be there, and is not changed.
+            readonly: Only read: the file must be there, and is not changed.
 
         Raises:
             StoreError: the folder cannot be written, or the file is no sound result store, or is not there.
@@ -162,21 +164,14 @@ class Store:
             ) from None
 
     def _prepare(self, readonly: bool) -> None:
-        if self._db.execute("pragma quick_check(1)").fetchone()[0] != "ok":
-            raise sqlite3.DatabaseError("its pages are damaged")
-        tables = {row[0] for row in self._db.execute("select name from sqlite_master where type = 'table'")}
-        columns = {row[1] for row in self._db.execute("pragma table_info(results)")}
-        if (tables or readonly) and columns != _COLUMNS:
-            raise sqlite3.DatabaseError("its tables are another program's or another version's")
-        if readonly:  # what an older version has not got is empty, in memory
-            self._db.execute("pragma temp_store = memory")
-            lacking = [f"create temp table {name} {_TABLES[name]};" for name in _TABLES if name not in tables]
-            self._db.executescript("".join(lacking))
+        tables = check_store(self._db, self.path)
+        if readonly and not tables:
+            raise sqlite3.DatabaseError("it is empty")
+        if readonly:
             return
         self._db.execute("pragma journal_mode=wal")
         self._db.execute("pragma synchronous=normal")
-        made = (f"create table if not exists {name} {columns};" for name, columns in _TABLES.items())
-        self._db.executescript(f"begin immediate; {''.join(made)} {_INDEX} commit;")
+        create_tables(self._db)
 
     def close(self) -> None:
         """Close the file."""
@@ -244,7 +239,7 @@ class Store:
     def metrics(self, cell: Cell, seeds: Iterable[int]) -> dict[int, dict[str, float]]:
         """Return the metrics of the finished ones of the seeds, without reading their curves.
 
-        They are as sound as they were when ``have`` last looked.
+        They are as sound as they were when ``have`` last checked them.
         """
         wanted = set(seeds)
         rows = self._db.execute("select seed, metrics from results where key = ?", (cell.key,))
@@ -291,7 +286,7 @@ class Store:
         return [tuple(row) for row in self._db.execute("select key, seed, reason from quarantine")]
 
     def cells(self) -> list[Stored]:
-        """Return all cells, whatever program wrote them; they are as sound as they were when ``have`` last looked."""
+        """Return all cells, whatever program wrote them; they are as sound as ``have`` last found them."""
         metrics: dict[str, dict[int, dict[str, float]]] = defaultdict(dict)
         for key, seed, text in self._db.execute("select key, seed, metrics from results order by seed"):
             metrics[key][seed] = json.loads(text)
@@ -309,7 +304,7 @@ class Store:
         return int(row[0]), int(row[1])
 
     def begin(self, owner: Owner, total: int) -> None:
-        """Write down that a process goes to work on ``total`` missing seeds; what the dead had claimed is free."""
+        """Write down that a process goes to work on ``total`` missing seeds; claims of processes that have died end."""
         now = time.time()
         with self._writing():
             for run in self.runs():
@@ -322,7 +317,7 @@ class Store:
             )
 
     def report(self, owner: Owner, done: int, failed: int, remaining: float | None) -> None:
-        """Write down how far a process is, for those who look on."""
+        """Write down how far a process is, for ``uard status``."""
         with self._writing():
             self._db.execute(
                 "update runs set beat = ?, done = ?, failed = ?, remaining = ?, ended = null where token = ?",
@@ -367,17 +362,17 @@ class Store:
                     "delete from claims where key = ? and seed = ? and token = ?", (cell.key, seed, owner.token)
                 )
 
-    def runs(self) -> list[Run]:
+    def runs(self) -> list[WorkerRun]:
         """Return who works here, or died and was not replaced, or was last to end, in the order of their beginning."""
         query = """
             select token, host, place, pid, born, began, beat, total, done, failed, remaining, ended,
                 (select count(*) from claims where claims.token = runs.token)
             from runs where ended is null or ended = (select max(ended) from runs) order by began
         """
-        return [Run(Owner(*row[:5]), *row[5:]) for row in self._db.execute(query)]
+        return [WorkerRun(Owner(*row[:5]), *row[5:]) for row in self._db.execute(query)]
 
-    def claimed(self) -> dict[tuple[str, int], Run]:
-        """Return who is training each (key, seed); what the dead have claimed is left out."""
+    def claimed(self) -> dict[tuple[str, int], WorkerRun]:
+        """Return who is training each (key, seed); claims of processes that have died are left out."""
         living = {run.owner.token: run for run in self.runs() if run.alive}
         rows = self._db.execute("select key, seed, token from claims").fetchall()
         return {(key, seed): living[token] for key, seed, token in rows if token in living}
@@ -395,15 +390,40 @@ class Store:
         return {(row[0], row[1]): FailedSeed(*row[2:]) for row in self._db.execute(query)}
 
     def finished(self) -> dict[str, dict[int, float]]:
-        """Return when each seed was finished, in seconds since 1970, by key; their bytes are not looked at."""
+        """Return when each seed was finished, in seconds since 1970, by key; their bytes are not read."""
         found: dict[str, dict[int, float]] = {}
         for key, seed, created in self._db.execute("select key, seed, created from results"):
             found.setdefault(key, {})[seed] = created
         return found
 
 
-def give_sign(path: str, owner: Owner) -> None:
-    """Write a process's sign of life into a store, from whichever thread.
+def check_store(db: sqlite3.Connection, path: str, version: int = FORMAT) -> set[str]:
+    """Return the tables of a sound store of a format, none of a new file.
+
+    Raises:
+        sqlite3.DatabaseError: it is damaged, or no store.
+        StoreError: its keys are of another format; with what to do.
+    """
+    if db.execute("pragma quick_check(1)").fetchone()[0] != "ok":
+        raise sqlite3.DatabaseError("its pages are damaged")
+    tables = {row[0] for row in db.execute("select name from sqlite_master where type = 'table'")}
+    if tables and {row[1] for row in db.execute("pragma table_info(results)")} != _COLUMNS:
+        raise sqlite3.DatabaseError("its tables are another program's")
+    found = db.execute("pragma user_version").fetchone()[0] or OLDEST  # which bore no number
+    if tables and found != version:
+        todo = f"`uard migrate {path}` brings it over; nothing is lost" if found < version else "a newer uard is needed"
+        raise StoreError(f"store = {path!r}: must be of format {version}, but it is of format {found}: {todo}")
+    return tables
+
+
+def create_tables(db: sqlite3.Connection) -> None:
+    """Make what is not there yet, all or nothing."""
+    made = (f"create table if not exists {name} {columns};" for name, columns in TABLES.items())
+    db.executescript(f"begin immediate; {''.join(made)} {_INDEX} pragma user_version = {FORMAT}; commit;")
+
+
+def record_heartbeat(path: str, owner: Owner) -> None:
+    """Write into a store that a process is alive, from whichever thread.
 
     Raises:
         StoreError: that is not possible.

@@ -7,9 +7,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 from uard import _checks
-from uard.agents.tabular import QLearning
 from uard.envs.grids.trapgrid import paper_grid
-from uard.envs.locomotion.physics import Locomotion
 from uard.lab import registry as names
 from uard.lab.cell import Cell
 from uard.lab.studies.common import LOCOMOTION_STEPS, PANELS
@@ -17,7 +15,6 @@ from uard.lab.studies.grids import COMPARED
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import named
 from uard.ratings.panels import as_panel
-from uard.training.feedback.rating_model import RatingModel
 
 AGENTS = ("q-learning", "ensemble-dqn", "ppo")  # the first that can work in an environment learns there
 
@@ -54,16 +51,17 @@ def agents() -> tuple[Row, ...]:
     for plugin, agent in names.brought("agent")[0].items():
         name, grid = "TrapGrid6", paper_grid(6)
         if not names.can_work(agent, grid):
-            name, grid = "Hopper-Vibration", Locomotion()
+            name = "Hopper-Vibration"
+            grid = names.ENVIRONMENTS[name]
         rows += _crossed(name, grid, plugin.name, agent, (*PANELS, "colluding"))
         rows += _crossed(f"{name}, legitimate", replace(grid, legitimate=True), plugin.name, agent, PANELS)
     return tuple(rows)
 
 
 def _crossed(where: str, environment: Any, name: str, agent: Any, panels: tuple[str, ...]) -> list[Row]:
-    physical = isinstance(environment, Locomotion)
-    rating_model = None if physical or isinstance(agent, QLearning) else RatingModel()
-    steps = LOCOMOTION_STEPS if physical else None
+    trainer = names.trainer(agent, environment)
+    rating_model = trainer.usual_rating_model
+    steps = LOCOMOTION_STEPS if trainer.budget == "steps" else None
     return [
         row(
             Cell(environment, named(mitigation), agent, as_panel(panel), rating_model=rating_model, steps=steps),

@@ -9,6 +9,7 @@ and metrics at 5 %, whatever the distributions are and however metrics and cells
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import zlib
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from uard import _checks
+from uard.lab.config import TYPE
 from uard.lab.execution.store import Store
 from uard.lab.result import Result, digest
 from uard.lab.statistics import hedges_g
@@ -239,22 +241,13 @@ def _corrected(differences: np.ndarray, signs: np.ndarray) -> np.ndarray:
 
 def as_data(comparison: Comparison) -> dict[str, Any]:
     """Return it as plain data."""
-    from uard.lab.cell import plain
-
-    data = plain(comparison)
-    return {"identical": comparison.identical, "differs": comparison.differs, "level": LEVEL, **_named(data)}
-
-
-def _named(data: Any) -> Any:
-    """Drop the names of classes, but for those in configurations."""
-    if isinstance(data, dict):
-        return {k: v if k in ("config", "only_a", "only_b") else _named(v) for k, v in data.items() if k != "class"}
-    return [_named(v) for v in data] if isinstance(data, list) else data
+    head = {"identical": comparison.identical, "differs": comparison.differs, "level": LEVEL}
+    return head | dataclasses.asdict(comparison)
 
 
 def title(config: dict[str, Any]) -> str:
     """Return what a cell is about, for one that is in no study."""
-    names = [config[part]["class"].rpartition(".")[2] for part in ("environment", "mitigation", "agent")]
+    names = [config[part][TYPE].rpartition("/")[2] for part in ("environment", "mitigation", "agent")]
     return ", ".join(
         [*names, f"panel {panel_name(config['panel'])}", f"{config.get('steps') or config['episodes']} long"]
     )

@@ -18,7 +18,7 @@ from uard import InvalidValueError, __version__
 from uard._support import files
 from uard.lab import registry as names
 from uard.lab import statistics
-from uard.lab.cell import plain
+from uard.lab.config import TYPE, plain
 from uard.lab.execution.store import Store
 from uard.lab.views.tables import number
 from uard.lab.views.templates import HERE, render
@@ -219,10 +219,11 @@ def _line(
 ) -> Line:
     mitigation = known.of("mitigation", config["mitigation"])
     panel, twin = panel_name(config["panel"]), config["environment"].get("legitimate", False)
-    trained = [f"{config['steps']:,} steps" if "steps" in config else f"{config['episodes']:,} episodes"]
+    steps = config["steps"]
+    trained = [f"{config['episodes']:,} episodes" if steps is None else f"{steps:,} steps"]
     tabular = "heads" in config["agent"]
-    if "steps" not in config and not tabular:
-        trained.append("learned ratings" if "rating_model" in config else "running means")
+    if steps is None and not tabular:
+        trained.append("learned ratings" if config["rating_model"] else "running means")
     trained += [f"{name} {config[name]}" for name in ("ddof", "snapshots") if config[name]]
     return Line(
         known.of("environment", config["environment"]),
@@ -242,8 +243,6 @@ def _line(
 
 def panel_name(config: Any) -> str:
     """Return what the panel of a stored configuration is called; ``of its own`` if it has no name."""
-    if isinstance(config, str):
-        return config
     return next((name for name, panel in PANELS.items() if plain(panel) == config), "of its own")
 
 
@@ -263,16 +262,16 @@ class _Names:
             more = names.CONTINUOUS if kind == "agent" else {}
             for name, value in [*values.items(), *theirs.items(), *more.items()]:
                 config = plain(value)
-                self._prototypes[kind, config["class"]].append((name, _leaves(config)))
+                self._prototypes[kind, config[TYPE]].append((name, _leaves(config)))
         self._seen: dict[str, str] = {}
         self._varies: dict[str, set[str]] = defaultdict(set)
         first: dict[str, dict[str, Any]] = {}
         for config in configs:
             for kind in own:
                 leaves = _leaves(config[kind])
-                before = first.setdefault(config[kind]["class"], leaves)
+                before = first.setdefault(config[kind][TYPE], leaves)
                 changed = {k for k in leaves.keys() | before.keys() if leaves.get(k) != before.get(k)}
-                self._varies[config[kind]["class"]] |= changed
+                self._varies[config[kind][TYPE]] |= changed
 
     def of(self, kind: str, config: dict[str, Any]) -> str:
         """Return the nearest name and what differs from it; the class and what varies if there is no name for it."""
@@ -282,7 +281,7 @@ class _Names:
         return self._seen[key]
 
     def _describe(self, kind: str, config: dict[str, Any]) -> str:
-        leaves, cls = _leaves(config), config["class"]
+        leaves, cls = _leaves(config), config[TYPE]
         candidates = [(_different(leaves, base), name) for name, base in self._prototypes[kind, cls]]
         exact = [name for changes, name in candidates if not changes]
         if exact:
@@ -290,7 +289,7 @@ class _Names:
         if candidates:
             changes, name = min(candidates, key=lambda c: len(c[0]))
         else:
-            changes, name = {k: leaves[k] for k in sorted(self._varies[cls]) if k in leaves}, cls.rpartition(".")[2]
+            changes, name = {k: leaves[k] for k in sorted(self._varies[cls]) if k in leaves}, cls.rpartition("/")[2]
         return ", ".join([name, *(_said(k.rpartition(".")[2], v) for k, v in changes.items())])
 
 
@@ -300,7 +299,7 @@ def _leaves(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     for name, value in config.items():
         if isinstance(value, dict):
             out |= _leaves(value, f"{prefix}{name}.")
-        elif name != "class" or prefix:
+        elif name != TYPE or prefix:
             out[prefix + name] = value
     return out
 

@@ -25,13 +25,15 @@ import numpy as np
 
 from uard import __version__, _checks
 from uard.lab import statistics
-from uard.lab.cell import RESULTS, Cell
+from uard.lab.cell import Cell
+from uard.lab.config import FORMAT
 from uard.lab.execution.store import Store
 from uard.lab.result import Result
 from uard.lab.statistics import Summary
 from uard.lab.study import Row, Study
 from uard.plugins import Plugin, PluginError, brought
 
+MIGRATE = "`uard migrate FILE.json` brings published results over"
 KEPT = ("calibration", "rating_error")  # of what a result holds beside its curves, as it is
 BIN = 10  # episodes
 
@@ -65,7 +67,7 @@ def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], comman
         "command": command,
         "version": __version__,
         "commit": checkout(),
-        "results": RESULTS,
+        "format": FORMAT,
         "packages": {p: metadata.version(p) for p in packages} | {"python": platform.python_version()},
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "cells": cells,
@@ -126,13 +128,18 @@ class Published:
     """
 
     def __init__(self, studies: Sequence[Study], files: Sequence[dict[str, Any]]):
-        """Read what ``extract`` gave."""
+        """Read what ``extract`` gave.
+
+        Raises:
+            InvalidValueError: something of another format of keys.
+        """
         self.studies = {s.name: s for s in studies}
         self.sources = [{k: v for k, v in f.items() if k != "cells"} for f in files]
         self._cells: dict[str, Any] = {}
         for f in files:
-            if f["results"] == RESULTS:
-                self._cells |= f["cells"]
+            if (wrong := _wrong_format(f)) is not None:
+                raise _checks.InvalidValueError("format", wrong, f"{FORMAT}: {MIGRATE}")
+            self._cells |= f["cells"]
 
     @property
     def cells(self) -> tuple[str, ...]:
@@ -196,20 +203,39 @@ def packaged() -> Published:
     """Return what is published with this version and the installed packages."""
     from uard.lab.studies import every
 
-    files = [place.folder / name for place in _places() for name in place.studies]
-    return Published(every(), [json.loads(file.read_text(encoding="utf-8")) for file in files])
+    places = [_OWN, *brought("results", _checked)[0].values()]
+    return Published(every(), [_read(place, name) for place in places for name in place.studies])
 
 
 def broken() -> list[PluginError]:
     """Return an error for each package's published results that cannot be used."""
-    return brought("results", _called)[1]
+    return brought("results", _checked)[1]
+
+
+_OWN = ResultFiles(resources.files("uard.lab.published"), ("games.json",))
 
 
 def _places() -> list[ResultFiles]:
-    return [
-        ResultFiles(resources.files("uard.lab.published"), ("games.json",)),
-        *brought("results", _called)[0].values(),
-    ]
+    return [_OWN, *brought("results", _called)[0].values()]
+
+
+def _read(place: ResultFiles, name: str) -> Any:
+    return json.loads((place.folder / name).read_text(encoding="utf-8"))
+
+
+def _wrong_format(data: dict[str, Any]) -> Any:
+    """Return the format of a file's keys if it is not the present one."""
+    found = data.get("format", data.get("results", "none"))  # as it was called before format 3
+    return None if found == FORMAT else found
+
+
+def _checked(plugin: Plugin) -> ResultFiles:
+    """Return a package's files; those of studies must have keys of the present format."""
+    made = _called(plugin)
+    for name in made.studies:
+        if (wrong := _wrong_format(_read(made, name))) is not None:
+            raise PluginError(plugin, f"{name} is of format {wrong}, not {FORMAT}: {MIGRATE}")
+    return made
 
 
 def _called(plugin: Plugin) -> ResultFiles:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from uard.lab.execution.store import FailedSeed, Run, Store
+from uard.lab.execution.store import FailedSeed, Store, WorkerRun
 from uard.lab.study import Study
 
 SEEDS = 10  # of a study of which the store knows nothing
@@ -65,7 +65,7 @@ class Status:
 
     cells: int
     seeds: int
-    runs: tuple[Run, ...]
+    runs: tuple[WorkerRun, ...]
     studies: tuple[StudyStatus, ...]
     failures: tuple[FailedCell, ...]
 
@@ -137,7 +137,7 @@ def clock(when: float) -> str:
     return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(when))
 
 
-def lines(runs: Iterable[Run], now: float | None = None) -> list[str]:
+def lines(runs: Iterable[WorkerRun], now: float | None = None) -> list[str]:
     """Return one line for every process: alive or dead, how far, how fast, how long still."""
     now, found = time.time() if now is None else now, []
     for run in runs:

@@ -1,7 +1,8 @@
 """Training on a simulator: physics on the host, networks in compiled functions, everything resumable to the bit.
 
-A run's whole state is one pytree of arrays (``TrainState``). It is advanced by pieces (a rollout, or some steps with their
-updates); between pieces it can be written down and taken up again, and no random number depends on when that happened.
+A run's whole state is one pytree of arrays (``TrainState``). It is advanced by pieces (a rollout, or some steps with
+their updates); between pieces it can be written down and taken up again, and no random number depends on when that
+happened.
 """
 
 from __future__ import annotations
@@ -274,7 +275,7 @@ def run(
     """Train, going on from the checkpoint at ``path`` if there is one.
 
     Args:
-        loop: Of the run; ``uard.training.trainers.host_loop`` finds it.
+        loop: Of the run; ``uard.training.host.loops.loop_of`` finds it.
         path: Where to keep the checkpoint; nowhere if None.
         config: What the run is, as text, so that no other run's checkpoint is gone on from.
         every: Environment steps between checkpoints.

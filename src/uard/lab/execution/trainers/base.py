@@ -51,6 +51,11 @@ class Trainer(ABC):
         """Whether it trains such an agent in such an environment."""
         return environment.kind in self.kinds and agent.family in self.families
 
+    @property
+    def usual_rating_model(self) -> RatingModel | TransitionModel | None:
+        """How it knows of ratings if nothing is said."""
+        return next(iter(self.rating_models.values()))
+
     def program(self, cell: Cell) -> Hashable:
         """Return what cells must have in common to be trained by one call, and to share a compiled program."""
         raters = cell.panel.raters

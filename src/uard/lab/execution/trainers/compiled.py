@@ -51,9 +51,7 @@ class Compiled(Trainer):
         first = batch[0][0]
         make_room(self.program(first))
         worlds = {cell: cell.environment.world(cell.panel, cell.noise) for cell, _ in batch}
-        several = [
-            common.make_run(worlds[c], c.agent, c.mitigation, seed, c.rated, c.rating_model) for c, seed in batch
-        ]
+        several = [common.make_run(worlds[c], c.agent, c.mitigation, seed, c.rated, _model_of(c)) for c, seed in batch]
         program = common.Program(first.episodes, ddof=first.ddof)
         trained = runs.train(several, self.loop(), program, common.TrainedAgent._fields, common.ROOM)
         return [partial(_finish, cell, seed, out) for (cell, seed), out in zip(batch, trained, strict=True)]
@@ -87,6 +85,10 @@ class CompiledRollout(Compiled):
         from uard.training.compiled import on_policy
 
         return on_policy.train_one
+
+
+def _model_of(cell: Cell) -> RatingModel | None:
+    return cell.rating_model if isinstance(cell.rating_model, RatingModel) else None
 
 
 def _finish(cell: Cell, seed: int, out: dict[str, Any]) -> Result:

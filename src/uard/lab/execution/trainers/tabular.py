@@ -62,9 +62,7 @@ class Tabular(Trainer):
         if first.snapshots:
             fields = (*fields, "q_snapshots", "feedback_snapshots")
         trained = tabular.train(runs, program, fields)
-        return [
-            partial(_finish, cell, *tables[cell][:2], out) for (cell, _), out in zip(batch, trained, strict=True)
-        ]
+        return [partial(_finish, cell, *tables[cell][:2], out) for (cell, _), out in zip(batch, trained, strict=True)]
 
 
 def place_of_tables(environment: Any) -> Hashable:
