@@ -1,29 +1,46 @@
 import dataclasses
+import hashlib
+import importlib
 import json
 import math
+import os
+import pkgutil
 import subprocess
 import sys
+import typing
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import uard
 from uard import InvalidValueError, LearningSignal, Mitigation, RewardDiscounting
-from uard._checks import UnknownNameError
+from uard.agents.base import Agent
 from uard.agents.tabular import QLearning
+from uard.envs.base import Environment
 from uard.envs.grids.trapgrid import TrapGrid
-from uard.lab.cell import RESULTS, Cell, plain
+from uard.lab.cell import Cell
+from uard.lab.config import FORMAT, key_of, plain, type_name
+from uard.lab.execution.trainers import TRAINERS
+from uard.lab.registry import AGENTS, CONTINUOUS, ENVIRONMENTS
 from uard.method.abstention import Abstention
 from uard.method.mitigations import RatedReward, Raw, Screening, named
+from uard.ratings.panels import PANELS, Panel, Rater
+from uard.training.feedback.rating_model import RatingModel
+from uard.training.feedback.transition_model import TransitionModel
 
-GOLDEN = "f6c55a69918eb82029fdea2566d4ac39"
+GOLDEN = "948d549bc5d29ff78cc507a969ccdd5c"
 FULL = Cell(
     TrapGrid(),
     named("uard"),
     QLearning(bootstrap=0.5, abstention=Abstention()),
+    Panel((Rater(), Rater()), -1.0, 10.0),
 )
 CHANGED = {
-    "panel": "single",
+    "panel.raters": (Rater(), Rater(lapse=0.1)),
+    "panel.low": -2.0,
+    "panel.high": 20.0,
     "noise": 0.5,
     "rated": 0.5,
     "episodes": 7,
@@ -81,12 +98,32 @@ def leaves(value, prefix=""):
             yield prefix + f.name
 
 
+RATER = {
+    "temptation": 0.5,
+    "bias": 0.1,
+    "scale": 2.0,
+    "noise": 0.3,
+    "contested_noise": 0.1,
+    "lapse": 0.2,
+    "coverage": 0.9,
+    "stars": 5,
+}
+
+
 @dataclass(frozen=True)
 class Own(Mitigation):
     k: float = 1.0
     note: object = None
     parts: tuple = ()
     inner: Raw = field(default_factory=Raw)
+
+    def signal(self, evidence, usual):
+        return LearningSignal(evidence.reward, 1.0)
+
+
+@dataclass(frozen=True)
+class Misnamed(Mitigation):
+    type: str = "a"
 
     def signal(self, evidence, usual):
         return LearningSignal(evidence.reward, 1.0)
@@ -104,14 +141,15 @@ class Thawed(Mitigation):
 
 
 def test_every_field_is_tried_below():
-    assert set(leaves(FULL)) | {"agent.abstention"} == set(CHANGED) | {"feedback", "steps", "query"}, (
-        "test_deep_lab, test_locomotion_lab"
-    )
+    elsewhere = {"rating_model", "steps", "query"}  # test_deep_lab, test_locomotion_lab
+    assert set(leaves(FULL)) | {"agent.abstention"} == set(CHANGED) | elsewhere
+    assert set(RATER) == {f.name for f in dataclasses.fields(Rater)}
 
 
 def test_the_key_depends_on_every_field():
     keys = {name: with_changed(FULL, name, new).key for name, new in CHANGED.items()}
-    assert len({FULL.key, *keys.values()}) == len(CHANGED) + 1
+    raters = [FULL.with_(panel=Panel((Rater(), Rater(**{n: v})), -1.0, 10.0)).key for n, v in RATER.items()]
+    assert len({FULL.key, *keys.values(), *raters}) == len(CHANGED) + len(RATER) + 1
 
 
 def test_the_key_depends_on_the_classes():
@@ -124,7 +162,11 @@ def test_the_key_depends_on_the_classes():
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        (FULL, Cell(TrapGrid(), named("uard"), QLearning(bootstrap=0.5, abstention=Abstention()))),
+        (FULL, Cell(TrapGrid(), named("uard"), FULL.agent, Panel((Rater(scale=1), Rater(bias=-0.0)), -1, 10))),
+        (
+            FULL.with_(panel=Panel((Rater(contested_noise=1),))),
+            FULL.with_(panel=Panel((Rater(contested_noise=np.float64(1.0)),))),
+        ),
         (Cell(TrapGrid(6)), Cell(TrapGrid(traps=((3, 3),), goal=(5, 5), horizon=40))),
         (Cell(agent=QLearning(epsilon=1)), Cell(agent=QLearning(epsilon=1.0))),
         (Cell(agent=QLearning(heads=1, bootstrap=0.5)), Cell(agent=QLearning(heads=1))),
@@ -144,8 +186,8 @@ def test_equal_cells_have_equal_keys(one, other):
     assert one.key == other.key
 
 
-@pytest.mark.parametrize("changes", [{"panel": "appendix"}, {"noise": 2.0}, {"rated": 0.1}])
-def test_what_the_raters_do_does_not_matter_to_who_does_not_listen(changes):
+@pytest.mark.parametrize("changes", [{"panel": PANELS["appendix"]}, {"noise": 2.0}, {"rated": 0.1}])
+def test_what_the_raters_do_does_not_matter_to_a_mitigation_that_asks_nobody(changes):
     assert Cell(mitigation=Raw(), **changes) == Cell(mitigation=Raw())
     assert Cell(mitigation=RatedReward(), **changes).key != Cell(mitigation=RatedReward()).key
 
@@ -153,7 +195,7 @@ def test_what_the_raters_do_does_not_matter_to_who_does_not_listen(changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"panel": "mian"}, r"^panel = 'mian': .*did you mean 'main'"),
+        ({"panel": "main"}, r"^panel = 'main': must be a frozen dataclass that is a Panel \(see uard\.ratings\.panels"),
         ({"panel": None}, "^panel = None"),
         ({"noise": -1}, r"^noise = -1: must be a finite number >= 0"),
         ({"noise": math.nan}, r"^noise = nan"),
@@ -167,8 +209,8 @@ def test_what_the_raters_do_does_not_matter_to_who_does_not_listen(changes):
         ({"episodes": 5.0}, r"^episodes = 5\.0"),
         ({"ddof": 2}, "^ddof = 2"),
         ({"snapshots": -1}, "^snapshots = -1"),
-        ({"environment": 6}, "^environment = 6: must be a frozen dataclass that is a Spec"),
-        ({"agent": "q-learning"}, "^agent = 'q-learning': must be a frozen dataclass that is a QLearning"),
+        ({"environment": 6}, "^environment = 6: must be a frozen dataclass that is an Environment"),
+        ({"agent": "q-learning"}, "^agent = 'q-learning': must be a frozen dataclass that is an Agent"),
         ({"mitigation": "uard"}, "^mitigation = 'uard': must be a frozen dataclass that is a Mitigation"),
         ({"mitigation": None}, "^mitigation = None"),
         ({"mitigation": Raw}, "^mitigation = <class .*Raw'>"),
@@ -179,16 +221,12 @@ def test_what_the_raters_do_does_not_matter_to_who_does_not_listen(changes):
         ({"mitigation": Own(note=[1])}, r"^mitigation\.note = \[1\]: must be a number, text"),
         ({"mitigation": Own(parts=(1, np.zeros(2)))}, r"^mitigation\.parts\[1\] = array"),
         ({"mitigation": Own(inner=Thawed())}, r"^mitigation\.inner = "),
+        ({"mitigation": Misnamed()}, r"^mitigation\.type = .*without a field named 'type'"),
     ],
 )
 def test_errors_name_the_field(changes, message):
     with pytest.raises(InvalidValueError, match=message):
         Cell(**changes)
-
-
-def test_an_unknown_panel_is_an_unknown_name():
-    with pytest.raises(UnknownNameError):
-        Cell(panel="appendx")
 
 
 def test_changing_a_cell_checks_it_again():
@@ -197,18 +235,82 @@ def test_changing_a_cell_checks_it_again():
         FULL.with_(noise=-1)
 
 
-def test_the_configuration_is_plain_data_that_names_its_classes():
+def test_the_configuration_is_plain_data_of_all_fields_with_the_names_of_classes():
     config = json.loads(json.dumps(FULL.config(), allow_nan=False))
-    assert config["mitigation"]["class"] == "uard.method.mitigations.RewardDiscounting"
+    assert config["type"] == "Cell"
+    assert config["mitigation"]["type"] == "RewardDiscounting"
     assert config["mitigation"]["filter"]["lam"] == 0.2
     assert config["environment"]["traps"] == [[3, 3]]
+    assert config["panel"]["raters"][0]["type"] == "Rater"
     assert config == plain(FULL)
-    assert not {"feedback", "steps", "query"} & set(config), "fields that came later, left out"
+    assert config.keys() == {"type", *(f.name for f in dataclasses.fields(Cell))}, "nothing is left out"
+
+
+def another(name, module):
+    """A class of a name in a module, alike but for that."""
+
+    @dataclass(frozen=True)
+    class Made(Mitigation):
+        limit: float = 0.5
+
+        def signal(self, evidence, statistics):
+            return LearningSignal(evidence.reward, 1.0)
+
+    Made.__name__ = Made.__qualname__ = name
+    Made.__module__ = module
+    return Made
+
+
+def test_a_class_that_moves_keeps_its_key_and_no_other_package_can_take_it():
+    ours = Cell(mitigation=another("Screening", "uard.elsewhere.entirely")()).key
+    assert ours == Cell(mitigation=Screening(0.5)).key
+    homes = [another("Screening", m)() for m in ("theirs", "theirs.deeper.still", "uardian", "theirs2.uard")]
+    theirs = [Cell(mitigation=m).key for m in homes]
+    assert theirs[0] == theirs[1]
+    assert len({ours, *theirs}) == 4
+    assert [type_name(type(m)) for m in homes[1:3]] == ["theirs/Screening", "uardian/Screening"]
+
+
+def test_no_two_classes_of_ours_that_can_be_in_a_cell_have_one_name():
+    """Those of environments, agents and mitigations, and of whatever stands in their fields or in a cell's."""
+    for module in pkgutil.walk_packages([str(Path(uard.__file__).parent)], "uard."):
+        if module.name.split(".")[1] in ("envs", "agents", "method", "ratings", "training", "lab"):
+            importlib.import_module(module.name)
+    kinds, seen = [Cell, Environment, Agent, Mitigation, RatingModel, TransitionModel], []
+    while kinds:
+        kind = kinds.pop()
+        if kind in seen:
+            continue
+        seen.append(kind)
+        kinds += [c for c in kind.__subclasses__() if getattr(sys.modules.get(c.__module__), c.__name__, None) is c]
+        if dataclasses.is_dataclass(kind):
+            hints = typing.get_type_hints(kind).values()
+            kinds += [c for h in hints for c in (h, *typing.get_args(h)) if dataclasses.is_dataclass(c)]
+    names = [type_name(kind) for kind in seen if kind.__module__.startswith("uard.")]
+    assert len(set(names)) == len(names)
+    assert {"TrapGrid", "PPO", "Rater", "Ensemble", "ReliabilityFilter", "Abstention", "Kick"} <= set(names)
+
+
+def test_a_raised_version_changes_the_keys_of_that_kind_of_training_only(monkeypatch):
+    cells = [Cell(), Cell(agent=AGENTS["dqn"]), Cell(agent=AGENTS["ppo"])]
+    cells += [Cell(ENVIRONMENTS["Hopper"], agent=CONTINUOUS[name]) for name in ("sac", "ppo")]
+    assert [type(c.trainer) for c in cells] == [type(t) for t in TRAINERS], "one of each kind"
+    for raised in cells:
+        before = [c.key for c in cells]
+        monkeypatch.setattr(type(raised.trainer), "version", raised.trainer.version + 1)
+        after = [replace(c).key for c in cells]
+        assert [b != a for b, a in zip(before, after, strict=True)] == [c is raised for c in cells]
+        monkeypatch.undo()
+
+
+def test_the_key_is_a_hash_of_format_trainer_and_configuration():
+    text = json.dumps({"format": FORMAT, "trainer": ["tabular", 1], "cell": FULL.config()}, sort_keys=True)
+    assert FULL.key == key_of(FULL.config(), "tabular", 1) == hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 def test_keys_are_the_same_in_every_process_and_release():
     code = "from uard.lab.cell import Cell; print(Cell().key)"
-    environment = {"PYTHONHASHSEED": "1", "PATH": ""}
+    environment = {"PYTHONHASHSEED": "1", "PATH": ""} | {k: v for k, v in os.environ.items() if k == "PYTHONPATH"}
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
-    assert RESULTS == 2
+    assert FORMAT == 3
     assert Cell().key == other.stdout.strip() == GOLDEN

@@ -21,6 +21,7 @@ from uard.lab import registry as names
 from uard.lab import studies
 from uard.lab.cell import Cell
 from uard.lab.execution import examine, runner
+from uard.lab.execution.batching import shape_of
 from uard.lab.execution.store import Store
 from uard.lab.study import Study, row
 from uard.lab.views import published
@@ -63,12 +64,11 @@ def test_bad_cells_are_refused(changes, message):
         small(**changes)
 
 
-def test_the_rating_model_is_part_of_the_key_and_its_absence_is_not():
+def test_the_rating_model_is_part_of_the_key_where_ratings_are_asked_for():
     assert small().key != small(rating_model=None).key
     assert small().key != small(rating_model=RatingModel(3, 8, fits=2, batch=16)).key
-    assert "rating_model" not in small(rating_model=None).config()
-    deaf = small(mitigation=named("raw"))
-    assert deaf.rating_model is None, "an agent that hears nobody has no model of them"
+    raw = small(mitigation=named("raw"))
+    assert raw.rating_model is None, "who asks nobody has no model of what they say"
 
 
 def test_all_deep_agents_share_network_budget_and_discount():
@@ -91,14 +91,14 @@ def test_every_study_has_a_name_of_its_own_and_rows_of_their_own():
     assert [s.name for s in studies.find(("gaming", "scale"))] == ["gaming", "scale"]
 
 
-def test_deep_lanes_of_one_program_are_trained_together_and_stored_one_by_one():
+def test_deep_runs_of_one_program_are_trained_together_and_stored_one_by_one():
     store = Store(":memory:")
     cells = [
         small(),
         small(noise=0.5),
         small(environment=TrapGrid(size=4, traps=((1, 2),), trap_reward=8.0, horizon=12)),
     ]
-    assert len({runner.shape_of(c)[0] for c in cells}) == 1
+    assert len({shape_of(c)[0] for c in cells}) == 1
     assert runner.run([(c, s) for c in cells for s in range(2)], store, workers=1) == 6
     (result, *_) = store.get(cells[0], [0]).values()
     assert result.log.shape == (20, 6)
@@ -148,7 +148,9 @@ def test_published_results_come_back_and_stale_ones_do_not():
     assert back.sources[0]["commit"] == checkout()
     with pytest.raises(LookupError, match="not published"):
         back.get("deep-baselines", "trap_visits", agent="b")
-    assert Published((study,), [data | {"results": -1}]).rows("deep-baselines") == [], "another version's training"
+    for older in ({"format": 1}, {"format": None, "results": 2}):
+        with pytest.raises(InvalidValueError, match=r"format = .*`uard migrate FILE\.json` brings"):
+            Published((study,), [data | older])
 
 
 def test_the_checkout_is_named_only_where_the_code_belongs_to_it(tmp_path, monkeypatch):

@@ -6,8 +6,8 @@ import pytest
 from uard.agents.value import DeepQ
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
+from uard.lab.execution.batching import batches, shape_of
 from uard.lab.execution.forecast import Forecast
-from uard.lab.execution.runner import batches, shape_of
 from uard.method.mitigations import named
 
 COMPILE = 3.0

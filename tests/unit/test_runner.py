@@ -15,9 +15,12 @@ from uard.agents.tabular import QLearning
 from uard.envs.grids.trapgrid import TrapGrid, paper_grid
 from uard.lab.cell import Cell
 from uard.lab.execution import runner
-from uard.lab.execution.runner import StudyFailedError, batches, run, shape_of, train_batch
+from uard.lab.execution.batching import batches, shape_of
+from uard.lab.execution.runner import StudyFailedError, run
 from uard.lab.execution.store import Store
+from uard.lab.execution.training import train_batch
 from uard.method.mitigations import named
+from uard.ratings.panels import PANELS
 
 GRID = TrapGrid(size=4, traps=((1, 2),), horizon=8)
 USERS = """
@@ -122,7 +125,7 @@ def test_batches_hold_every_job_once_and_one_program_each():
         for noise in (0.0, 1.0)
     ]
     jobs = list(dict.fromkeys((c, seed) for seed in range(5) for c in cells))
-    made = batches(jobs, size=8)
+    made = batches(jobs, largest=8)
     assert sorted((j for b in made for j in b), key=str) == sorted(jobs, key=str)
     assert max(map(len, made)) == 8
     assert all(len({shape_of(c) for c, _ in batch}) == 1 for batch in made)
@@ -142,8 +145,8 @@ def test_batches_are_no_larger_than_asked(size):
     ("changes", "shared"),
     [
         ({"noise": 1.0}, True),
-        ({"panel": "appendix"}, True),
-        ({"panel": "single"}, False),
+        ({"panel": PANELS["appendix"]}, True),
+        ({"panel": PANELS["single"]}, False),
         ({"mitigation": named("uard", lam=9.0, kappa=0.0)}, True),
         ({"mitigation": named("uard", lam=9)}, True),
         ({"mitigation": named("uard", backup="consistent")}, False),
@@ -239,8 +242,8 @@ def test_failures_in_this_process(users, name):
 
 INTERRUPTED = """
 import sys
-from uard.lab import runner
-from uard.lab.store import Store
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store
 from test_runner import walks
 
 if __name__ == "__main__":
@@ -259,7 +262,7 @@ def walks(n=16):
 
 def test_an_interrupt_loses_nothing_that_was_finished(tmp_path):
     (tmp_path / "script.py").write_text(INTERRUPTED)
-    path = os.pathsep.join([str(tmp_path), os.path.dirname(__file__)])
+    path = os.pathsep.join([str(tmp_path), os.path.dirname(__file__), *sys.path])
     process = subprocess.Popen(
         [sys.executable, "script.py", "s.sqlite"],
         cwd=tmp_path,
@@ -288,11 +291,11 @@ def test_an_interrupt_loses_nothing_that_was_finished(tmp_path):
 def test_every_core_is_used_if_nothing_is_said(monkeypatch):
     asked = []
 
-    def spread(queue, workers, *_):
+    def several(queue, workers, *_):
         asked.append((len(queue), workers))
         yield from ()
 
-    monkeypatch.setattr(runner, "_spread", spread)
+    monkeypatch.setattr(runner, "in_processes", several)
     store = Store(":memory:")
     run([(cell(named("raw"), episodes=n), 0) for n in (1, 2)], store)
     store.close()

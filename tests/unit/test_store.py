@@ -60,7 +60,8 @@ def corrupt(path, seed):
 def child(code, *arguments, **options):
     prelude = (
         "import sys, time, numpy as np\n"
-        "from uard.lab.cell import Cell\nfrom uard.lab.result import Result\nfrom uard.lab.execution.store import Store\n"
+        "from uard.lab.cell import Cell\nfrom uard.lab.execution.store import Store\n"
+        "from uard.lab.result import Result\n"
         "def result(seed): return Result(np.full((3, 6), seed + 1, np.float32), seed, np.zeros(2, np.int32), {})\n"
         "cell, store = Cell(episodes=3), Store(sys.argv[1])\n"
     )

@@ -17,15 +17,15 @@ def shape_of(cell: Cell) -> tuple[Hashable, float]:
 
 
 def batches(jobs: Iterable[Job], largest: int | None = None) -> list[list[Job]]:
-    """Group jobs that one call can train, longest first.
+    """Group jobs that one call can train and that take equally long; the longest groups come first.
 
     Args:
         jobs: Each once.
         largest: Most jobs of a group, if less than the trainer takes.
     """
-    groups: dict[Hashable, list[Job]] = {}
+    groups: dict[tuple[Hashable, float], list[Job]] = {}
     for job in jobs:
-        groups.setdefault(shape_of(job[0])[0], []).append(job)
+        groups.setdefault(shape_of(job[0]), []).append(job)
     cut = []
     for group in groups.values():
         most = group[0][0].trainer.at_once

@@ -137,8 +137,8 @@ class Published:
         self.sources = [{k: v for k, v in f.items() if k != "cells"} for f in files]
         self._cells: dict[str, Any] = {}
         for f in files:
-            if (wrong := _wrong_format(f)) is not None:
-                raise _checks.InvalidValueError("format", wrong, f"{FORMAT}: {MIGRATE}")
+            if _format_of(f) != FORMAT:
+                raise _checks.InvalidValueError("format", _format_of(f), f"{FORMAT}: {MIGRATE}")
             self._cells |= f["cells"]
 
     @property
@@ -223,18 +223,17 @@ def _read(place: ResultFiles, name: str) -> Any:
     return json.loads((place.folder / name).read_text(encoding="utf-8"))
 
 
-def _wrong_format(data: dict[str, Any]) -> Any:
-    """Return the format of a file's keys if it is not the present one."""
-    found = data.get("format", data.get("results", "none"))  # as it was called before format 3
-    return None if found == FORMAT else found
+def _format_of(data: dict[str, Any]) -> Any:
+    """Return the format of a file's keys."""
+    return data.get("format") or data.get("results")  # as it was called before format 3
 
 
 def _checked(plugin: Plugin) -> ResultFiles:
     """Return a package's files; those of studies must have keys of the present format."""
     made = _called(plugin)
     for name in made.studies:
-        if (wrong := _wrong_format(_read(made, name))) is not None:
-            raise PluginError(plugin, f"{name} is of format {wrong}, not {FORMAT}: {MIGRATE}")
+        if (found := _format_of(_read(made, name))) != FORMAT:
+            raise PluginError(plugin, f"{name} is of format {found}, not {FORMAT}: {MIGRATE}")
     return made
 
 
