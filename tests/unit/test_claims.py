@@ -48,7 +48,8 @@ def owner():
 @pytest.fixture
 def stranger():
     """An owner in a process that has been killed and not been waited for."""
-    code = "import time; from uard.lab.execution.claims import Owner\nprint(repr(Owner.here()), flush=True); time.sleep(60)"
+    code = "import time; from uard.lab.execution.claims import Owner; print(repr(Owner.here()), flush=True)"
+    code += "; time.sleep(60)"
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     yield process, eval(process.stdout.readline(), {"Owner": Owner})
     process.kill()
