@@ -18,24 +18,27 @@ import numpy as np
 from uard.envs.grids.trapgrid import paper_grid
 from uard.lab import registry as names
 from uard.lab.cell import Cell
-from uard.lab.execution import cluster, runner
+from uard.lab.execution import cluster
 from uard.lab.execution.store import Store
+from uard.lab.execution.trainers.compiled import Compiled
+from uard.lab.execution.trainers.tabular import Tabular
+from uard.lab.execution.training import train_batch
 from uard.lab.result import Result
 from uard.method.mitigations import named
 from uard.training.feedback.rating_model import RatingModel
 
 
 def cells():
-    deep = {"feedback": RatingModel()}
+    deep = {"rating_model": RatingModel()}
     for name, cell, seeds in (
-        ("tabular", Cell(paper_grid(10), named("uard")), runner.BATCH),
+        ("tabular", Cell(paper_grid(10), named("uard")), Tabular.at_once),
         ("dqn", Cell(paper_grid(10), named("uard"), names.AGENTS["dqn"], **deep), 1),
         ("ppo", Cell(paper_grid(10), named("uard"), names.AGENTS["ppo"], **deep), 1),
     ):
         taken, results = [], []
         for first in (0, seeds):
             started = time.process_time()
-            results = runner.train_batch([(cell, first + i) for i in range(seeds)])
+            results = train_batch([(cell, first + i) for i in range(seeds)])
             taken.append(time.process_time() - started)
         size = sum(len(r.pack()[0]) for r in results) / seeds
         print(
@@ -53,7 +56,7 @@ def made_up(i):
 
 
 def store():
-    for batch in (1, runner.DEEP_BATCH, runner.BATCH):
+    for batch in (1, Compiled.at_once, Tabular.at_once):
         with tempfile.TemporaryDirectory() as folder:
             target = Store(Path(folder) / "s.sqlite")
             cell, results = Cell(), [made_up(i) for i in range(640)]
@@ -74,7 +77,7 @@ def _at_once(data, versions):
 
 
 def driver(batches=400):
-    cluster._there = _at_once
+    cluster.train_on_node = _at_once
     queue = [[(Cell(episodes=i + 1), s) for s in range(5)] for i in range(batches)]
     started = wall = None
     for n, _ in enumerate(cluster.Ray()(queue, None, list)):

@@ -28,6 +28,8 @@ from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
 from uard.lab.execution import runner
 from uard.lab.execution.store import Store
+from uard.lab.execution.trainers.tabular import Tabular
+from uard.lab.execution.training import train_batch
 from uard.lab.result import Result
 from uard.lab.study import Row, Study
 from uard.lab.views.evidence import Evidence
@@ -40,8 +42,8 @@ def overhead(batches: int, folder: Path) -> dict[str, Any]:
     """Run batches of about a second; a walker's horizon sets how long one takes."""
     walker = QLearning(heads=1, epsilon=1.0, epsilon_decay=1.0, epsilon_min=1.0)
     jobs = [(Cell(TrapGrid(16, horizon=10_000 + i), agent=walker, episodes=1500), 0) for i in range(batches)]
-    runner.train_batch(jobs[:1])  # compile
-    inside, train = [], runner._train_lanes
+    train_batch(jobs[:1])  # compile
+    inside, train = [], Tabular.train
 
     def timed(*work: Any) -> Any:
         began = time.perf_counter()
@@ -49,12 +51,12 @@ def overhead(batches: int, folder: Path) -> dict[str, Any]:
         inside.append(time.perf_counter() - began)
         return [lambda r=r: r for r in finished]
 
-    runner._train_lanes = timed
+    Tabular.train = timed
     with closing(Store(folder / "overhead.sqlite")) as store:
         began = time.perf_counter()
         runner.run(jobs, store, workers=1)
         total = time.perf_counter() - began
-    runner._train_lanes = train
+    Tabular.train = train
     share = (total - sum(inside)) / total
     return {"batches": batches, "seconds_a_batch": sum(inside) / batches, "seconds": total, "overhead": share}
 

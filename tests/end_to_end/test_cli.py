@@ -19,8 +19,8 @@ from uard.cli import app as cli
 from uard.cli import terminal
 from uard.lab import registry as names
 from uard.lab import studies
-from uard.lab.execution import runner
 from uard.lab.execution.store import Store
+from uard.lab.execution.trainers.tabular import Tabular
 from uard.lab.result import METRICS, Result
 from uard.method import mitigations as mitigation
 from uard.ratings.panels import PANELS
@@ -118,7 +118,7 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
         ),
         ("run BoatRace --noise-fraction 0.3", "noise_fraction = 0.3: must be left out where no trap pays"),
         ("run --agent dqn --feedback tabel", "feedback = 'tabel': must be one of *did you mean 'table'?"),
-        ("run --feedback model", "rating_model = RatingModel(*none for a tabular agent"),
+        ("run --feedback model", "feedback = 'model': must be one of table"),
         ("run --agent dqn --set-agent batch=0", "batch = 0: must be a whole number in [1, 4096]"),
         ("reproduce grid-dep", "study = 'grid-dep': must be one of *did you mean 'grid-deep'?"),
         ("run --panel mian", "panel = 'mian': must be one of *did you mean 'main'?"),
@@ -217,15 +217,15 @@ def test_reproduce_trains_nothing_twice(tmp_path):
 def test_what_failed_is_named_and_can_be_run_alone(tmp_path, monkeypatch, capsys):
     """The first two cells raise at first, and then no more."""
     monkeypatch.chdir(tmp_path)
-    study, train, bad = studies.find(("control",))[0], runner._train_lanes, []
+    study, train, bad = studies.find(("control",))[0], Tabular.train, []
     bad += [r.cell for r in study.rows[:2]]
 
-    def picky(batch, folder=None):
+    def picky(self, batch, folder=None):
         if any(cell in bad for cell, _ in batch):
             raise ValueError("not [this] one")
-        return train(batch, folder)
+        return train(self, batch, folder)
 
-    monkeypatch.setattr(runner, "_train_lanes", picky)
+    monkeypatch.setattr(Tabular, "train", picky)
     command = ["reproduce", "control", "--seeds", "2", "--workers", "1", "--store", "s.sqlite"]
     for _ in range(2):
         with pytest.raises(SystemExit) as stopped:

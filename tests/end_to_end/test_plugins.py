@@ -226,8 +226,8 @@ def test_fields_are_set_like_those_of_ours(example):
 def test_a_cell_is_keyed_by_class_and_fields(example):
     cell = Cell(example.BellCorridor(), example.Ceiling())
     config = cell.config()
-    assert config["mitigation"] == {"class": "Ceiling", "slack": 0.5}
-    assert config["environment"]["class"] == "BellCorridor"
+    assert config["mitigation"] == {"type": "uard_plugin_example/Ceiling", "slack": 0.5}
+    assert config["environment"]["type"] == "uard_plugin_example/BellCorridor"
     others = [
         cell.with_(mitigation=example.Ceiling(0.4)),
         cell.with_(environment=example.BellCorridor(legitimate=True)),

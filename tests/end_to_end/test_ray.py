@@ -135,7 +135,7 @@ def test_what_fails_is_told_apart_and_the_rest_is_stored(alone, monkeypatch):
 def test_a_connection_of_the_users_own_is_used_and_stays(cluster_of_two, alone, monkeypatch):
     """With a package that no node has, and for more than the nodes have."""
     ray.init(cluster_of_two[0].address, log_to_driver=False, logging_level="ERROR")
-    monkeypatch.setattr(cluster, "_there", alone.elsewhere)
+    monkeypatch.setattr(cluster, "train_on_node", alone.elsewhere)
     batch = [(small(), 1)]
     ((back, answer),) = Ray()([batch], None, list)
     assert back == batch
@@ -148,10 +148,10 @@ def test_a_connection_of_the_users_own_is_used_and_stays(cluster_of_two, alone, 
 
 
 def test_a_node_of_other_versions_is_refused():
-    answer = cluster._there(b"", {p: cluster._version(p) for p in cluster.NEEDED} | {"jax": "0.1"})
+    answer = cluster.train_on_node(b"", {p: cluster.version_of(p) for p in cluster.NEEDED} | {"jax": "0.1"})
     assert answer.startswith("this node has {'jax': '")
     assert "the driver {'jax': '0.1'}" in answer
-    assert cluster._version("no-such-package") is None
+    assert cluster.version_of("no-such-package") is None
 
 
 def test_an_address_where_nobody_answers_is_refused_within_seconds(monkeypatch):
@@ -161,7 +161,7 @@ def test_an_address_where_nobody_answers_is_refused_within_seconds(monkeypatch):
         started = time.monotonic()
         for address, why in ((f"127.0.0.1:{port}", "refused"), (f"127.0.0.1:{mute.getsockname()[1]}", "within 3 s")):
             with pytest.raises(ClusterError, match=rf"no Ray cluster answers there \(.*{why}"):
-                cluster._check_alive(address, patience=3)
+                cluster.check_alive(address, patience=3)
         assert time.monotonic() - started < 30
 
 

@@ -1,5 +1,6 @@
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -57,7 +58,7 @@ def stranger():
 
 
 @LINUX
-def test_a_process_is_alive_until_it_is_killed_whatever_its_last_sign(stranger):
+def test_a_process_is_alive_until_it_is_killed_whatever_its_last_heartbeat(stranger):
     process, other = stranger
     assert other.alive(beat=0)
     assert not replace(other, born=other.born - 1).alive(beat=time.time()), "a later process with the same id"
@@ -74,7 +75,7 @@ def test_one_that_has_stopped_is_dead_though_its_process_lives(owner):
     assert not owner.alive(beat=time.time()) or not owner.place
 
 
-def test_elsewhere_the_last_sign_of_life_decides(owner):
+def test_elsewhere_the_last_heartbeat_decides(owner):
     far = replace(owner, place="another kernel")
     for other in (far, replace(owner, place="")):
         assert other.alive(beat=1000, now=1000 + LEASE - 1)
@@ -124,11 +125,11 @@ def test_claims_of_the_dead_are_taken_over(store, owner, stranger):
     assert store.get(ONE, [0])[0].steps == 1, "a late result of the dead changes nothing"
 
 
-def test_a_sign_of_life_revives_one_that_was_held_for_dead(store, path, owner):
+def test_a_heartbeat_revives_one_that_counted_as_dead(store, path, owner):
     far = replace(owner, place="another kernel", token="far")
     store.begin(far, 1)
-    with store._writing():
-        store._db.execute("update runs set beat = 0 where token = 'far'")
+    with closing(sqlite3.connect(path)) as db, db:
+        db.execute("update runs set beat = 0 where token = 'far'")
     assert [run.alive for run in store.runs()] == [False]
     store.begin(owner, 1)
     assert far not in [run.owner for run in store.runs() if run.ended is None]

@@ -1,4 +1,5 @@
 import json
+import sqlite3
 import zlib
 from contextlib import closing
 
@@ -50,14 +51,16 @@ def test_equal_stores_are_identical(compared):
 
 def test_other_compression_of_the_same_bits_is_no_difference(tmp_path):
     with closing(filled(tmp_path / "a")) as a, closing(filled(tmp_path / "b")) as b:
-        for key, seed, data, metrics in b._db.execute("select key, seed, data, metrics from results").fetchall():
+        db = sqlite3.connect(b.path)
+        for key, seed, data, metrics in db.execute("select key, seed, data, metrics from results").fetchall():
             packed = zlib.compress(zlib.decompress(data), 9)
             assert packed != data
-            b._db.execute(
+            db.execute(
                 "update results set data = ?, checksum = ? where key = ? and seed = ?",
                 (packed, digest(packed + metrics.encode()), key, seed),
             )
-        b._db.commit()
+        db.commit()
+        db.close()
         assert compare(a, b).identical
 
 
@@ -113,8 +116,8 @@ def test_what_only_one_has_and_what_is_damaged_is_named(compared, tmp_path):
     assert (list(found.only_a), list(found.only_b)) == ([CELLS[0].key], [CELLS[3].key])
     assert [c.seeds for c in found.cells] == [tuple(range(8))] * 2
     with closing(Store(tmp_path / "0.sqlite")) as a, closing(Store(tmp_path / "1.sqlite")) as b:
-        a._db.execute("update results set metrics = replace(metrics, '1', '2') where seed = 2")
-        a._db.commit()
+        with closing(sqlite3.connect(a.path)) as db, db:
+            db.execute("update results set metrics = replace(metrics, '1', '2') where seed = 2")
         again = compare(a, b)
         assert {seed for _, _, seed in again.damaged} == {2}
         assert all(2 not in c.seeds for c in again.cells)

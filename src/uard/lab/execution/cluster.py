@@ -83,8 +83,8 @@ class Ray:
         if not self._slots(ray):
             have = {k: v for k, v in ray.cluster_resources().items() if k in ("CPU", "GPU")}
             raise ClusterError(f"no node of the Ray cluster has 1 CPU and {self.gpus:g} GPU for a task; it has {have}")
-        task = ray.remote(_there).options(num_cpus=1, num_gpus=self.gpus, max_retries=RETRIES)
-        versions = {package: _version(package) for package in NEEDED}
+        task = ray.remote(train_on_node).options(num_cpus=1, num_gpus=self.gpus, max_retries=RETRIES)
+        versions = {package: version_of(package) for package in NEEDED}
         waiting = (mine for batch in queue if (mine := claim(batch)))
         flying: dict[Any, list[Job]] = {}
 
@@ -103,7 +103,7 @@ class Ray:
                 finished, _ = ray.wait(list(flying), num_returns=1)
                 for reference in finished:
                     batch = flying.pop(reference)
-                    answer = _fetched(ray, reference)
+                    answer = _answer_of(ray, reference)
                     launch()
                     yield batch, answer
         finally:
@@ -117,16 +117,22 @@ class Ray:
         return sum(int(min(node)) for node in room)
 
 
-def _there(data: bytes, versions: dict[str, str | None]) -> Answer:
-    """Train a batch, on whichever node this runs."""
-    other = {p: here for p in versions if (here := _version(p)) != versions[p]}
+def train_on_node(data: bytes, versions: dict[str, str | None]) -> Answer:
+    """Train a packed batch on the node on which this runs.
+
+    Args:
+        data: See ``training.packed``.
+        versions: Of the driver's packages, by name; a node with others trains nothing.
+    """
+    other = {p: here for p in versions if (here := version_of(p)) != versions[p]}
     if other:
         driver = {p: versions[p] for p in other}
         return f"this node has {other}, the driver {driver}: install the same on every node"
     return attempt_packed(data)
 
 
-def _version(package: str) -> str | None:
+def version_of(package: str) -> str | None:
+    """Return the version of an installed package, None if there is none."""
     if package == "uard":
         from uard import __version__
 
@@ -137,7 +143,7 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _fetched(ray: Any, reference: Any) -> Answer:
+def _answer_of(ray: Any, reference: Any) -> Answer:
     try:
         return ray.get(reference)
     except ray.exceptions.RayTaskError:
@@ -162,7 +168,7 @@ def _connected(address: str | None) -> Iterator[Any]:
         if address is None:
             _start(ray, quiet)
         else:
-            _check_alive(address)
+            check_alive(address)
             ray.init(address=address, **quiet)
     except ClusterError:
         raise
@@ -170,7 +176,7 @@ def _connected(address: str | None) -> Iterator[Any]:
         ray.shutdown()
         if address is None:
             raise ClusterError(f"Ray could not be started on this machine: {error}") from error
-        raise _silent(address, error) from error
+        raise _no_answer(address, error) from error
     try:
         yield ray
     finally:
@@ -185,23 +191,27 @@ def _start(ray: Any, quiet: dict[str, Any]) -> None:
         ray.init(address="local", num_cpus=cores, include_dashboard=False, **quiet)
 
 
-def _check_alive(address: str, patience: float = 20.0) -> None:
-    """Ask the cluster for a sign of life; ``ray.init`` itself would wait for minutes."""
+def check_alive(address: str, patience: float = 20.0) -> None:
+    """Ask a cluster whether it is alive, for some seconds; ``ray.init`` itself would wait for minutes.
+
+    Raises:
+        ClusterError: it does not answer.
+    """
     command = [sys.executable, "-m", "ray.scripts.scripts", "health-check"]
     if address != "auto":
         host, _, port = address.rpartition(":")
         try:
             socket.create_connection((host, int(port)), timeout=5).close()
         except (OSError, OverflowError) as error:
-            raise _silent(address, error) from None
+            raise _no_answer(address, error) from None
         command += ["--address", address]
     try:
         subprocess.run(command, capture_output=True, timeout=patience, check=True)
     except (subprocess.TimeoutExpired, subprocess.CalledProcessError):
-        raise _silent(address, f"it did not answer within {patience:g} s") from None
+        raise _no_answer(address, f"it did not answer within {patience:g} s") from None
 
 
-def _silent(address: str, why: object) -> ClusterError:
+def _no_answer(address: str, why: object) -> ClusterError:
     return ClusterError(
         f"address = {address!r}: no Ray cluster answers there ({why}); start one with `ray start --head`, or leave the "
         "address out to use this machine"
