@@ -197,11 +197,12 @@ def answers(law: RatingLaw, normal: Array, uniform: Array | None = None) -> tupl
 
 
 def draw(law: RatingLaw, random: np.random.Generator) -> np.ndarray:
-    """Return one rating of every rater (..., K) as NumPy numbers, NaN where a rater did not answer."""
+    """Return one rating of every rater (..., K) as NumPy numbers, NaN where a rater did not or cannot answer."""
     normal = random.standard_normal(law.centre.shape)
     uniform = None if law.quirks is None else random.random((*law.centre.shape, UNIFORMS))
     ratings, mask = answers(law, normal, uniform)
-    return ratings if mask is None else np.where(mask, ratings, np.nan)
+    ratings = ratings if mask is None else np.where(mask, ratings, np.nan)
+    return ratings if law.reach is None else np.where(np.asarray(law.reach)[..., None] > 0, ratings, np.nan)
 
 
 # The paper gives no numbers for the first but sigma_h = 1.247, the deviation of {-1, 2, 1}. So on a contested step its
