@@ -135,9 +135,9 @@ def test_sac_lends_its_critics_and_takes_them_back(tmp_path):
     assert 0 < scalars(model)["weight"] < 1
     assert model.replay_buffer.steps.sigma_m is None
     model.save_replay_buffer(tmp_path / "buffer.pkl")
-    seen = model.replay_buffer.steps.stream.seen
+    seen = model.replay_buffer.steps.stream.rated
     model.load_replay_buffer(tmp_path / "buffer.pkl")
-    assert model.replay_buffer.steps.stream.seen == seen == 160
+    assert model.replay_buffer.steps.stream.rated == seen == 160
     model.learn(30, reset_num_timesteps=False, callback=ReliabilityCallback())
 
 
@@ -190,7 +190,7 @@ def test_what_was_learned_is_saved_and_loaded(tmp_path):
         env.step(random.integers(0, 4, 2))
     env.save(tmp_path / "stream.pkl")
     again = ReliabilityVecEnv.load(tmp_path / "stream.pkl", grids(2))
-    assert again.steps.stream.seen == 200
+    assert again.steps.stream.rated == 200
     assert again.steps.stream.mitigation == named("uard", lam=0.3)
     (tmp_path / "other.pkl").write_bytes(pickle.dumps([1]))
     with pytest.raises(

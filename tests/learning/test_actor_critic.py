@@ -29,10 +29,12 @@ def probe(next_state: list, reward: list, terminal: list, horizon: int, seed: in
     task = Task(np.int32(next_state), np.float32(reward), np.array(terminal, bool), np.int32(0), np.int32(horizon))
     shape = task.reward.shape
     truth = HiddenTruth(task.reward, np.zeros(shape, bool), task.terminal)
-    said = Ratings(np.zeros((*shape, 3), np.float32), np.ones((*shape, 3), np.float32))
+    distribution = Ratings(np.zeros((*shape, 3), np.float32), np.ones((*shape, 3), np.float32))
     settings: dict[str, Any] = {"network": NETWORK, "ensemble": Ensemble("full", 2, 0.0), "buffer": 1000, "batch": 32}
     settings |= {"warmup": 64, "tau": 0.05, "entropy_decay": 0.998, "entropy_min": 0.2}
-    return deep.lane(table_world(task, truth, said, 3), SoftActorCritic(**(settings | agent)), named("raw"), seed)
+    return deep.make_run(
+        table_world(task, truth, distribution, 3), SoftActorCritic(**(settings | agent)), named("raw"), seed
+    )
 
 
 def train(*several: Lane) -> list[dict[str, Any]]:

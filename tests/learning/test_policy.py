@@ -28,15 +28,15 @@ END = -1
 
 def tables(steps: dict[tuple[int, int], tuple[int, float]], horizon: int = 10, hack: Any = ()) -> TableWorld:
     """Build a world from (state, action) -> (next state or END, reward)."""
-    following = np.zeros((STATES, ACTIONS), np.int32)
+    next_observation = np.zeros((STATES, ACTIONS), np.int32)
     reward, terminal = np.zeros((STATES, ACTIONS), np.float32), np.ones((STATES, ACTIONS), bool)
     hacks = np.zeros((STATES, ACTIONS), bool)
     for place, (to, pay) in steps.items():
-        following[place], reward[place], terminal[place] = max(to, 0), pay, to == END
+        next_observation[place], reward[place], terminal[place] = max(to, 0), pay, to == END
         hacks[place] = place in hack
-    said = Ratings(np.stack([reward] * 3, -1), np.zeros((STATES, ACTIONS, 3), np.float32))
-    task = Task(following, reward, terminal, np.int32(0), np.int32(horizon))
-    return table_world(task, HiddenTruth(reward, hacks, hacks), said, STATES)
+    distribution = Ratings(np.stack([reward] * 3, -1), np.zeros((STATES, ACTIONS, 3), np.float32))
+    task = Task(next_observation, reward, terminal, np.int32(0), np.int32(horizon))
+    return table_world(task, HiddenTruth(reward, hacks, hacks), distribution, STATES)
 
 
 BOTH = (0, 1)
@@ -64,7 +64,7 @@ def train(cells: list[Any], program: deep.Program, fields: tuple[str, ...]) -> l
 @cache
 def probed(make: Any) -> dict[str, Any]:
     agent = make(gamma=GAMMA, count_bonus=0.0)
-    cells = [deep.lane(world, agent, named("raw"), 0) for world, _ in PROBES.values()]
+    cells = [deep.make_run(world, agent, named("raw"), 0) for world, _ in PROBES.values()]
     program = deep.Program(episodes=20_000, steps=20_000, walk=4)
     return dict(zip(PROBES, train(cells, program, ("values", "good", "log", "episodes")), strict=True))
 
@@ -95,7 +95,7 @@ def tempted() -> list[np.ndarray]:
     program = deep.Program(episodes=20_000, walk=4)
 
     def logs(agents: list[Any]) -> list[np.ndarray]:
-        cells = [deep.lane(TEMPTATION, agent, named("raw"), 0) for agent in agents]
+        cells = [deep.make_run(TEMPTATION, agent, named("raw"), 0) for agent in agents]
         return [out["log"] for out in train(cells, program, ("log",))]
 
     return [
@@ -121,7 +121,7 @@ def test_without_a_budget_the_temptation_is_taken():
 def on_grid(agent: Any, mitigation: str, seeds: range, trap: float = 4.0, panel: str = "main") -> np.ndarray:
     """Return the mean of the last 100 of 500 episodes, (seeds, len(LOG))."""
     world = paper_grid(10, trap, horizon=100).world(panel)
-    cells = [deep.lane(world, agent, named(mitigation), seed) for seed in seeds]
+    cells = [deep.make_run(world, agent, named(mitigation), seed) for seed in seeds]
     return np.stack([out["log"][-100:].mean(0) for out in train(cells, deep.Program(500), ("log",))])
 
 

@@ -46,8 +46,8 @@ def on_grid(
     grid = grid or paper_grid(6)
     task, truth = grid.task(), grid.truth()
     agent = agent or QLearning(epsilon_decay=0.98)
-    said = panels.ratings(panel, task, truth, noise)
-    return fused.lane(task, said, truth, agent, named(mitigation, **parameters), seed, rated)
+    distribution = panels.ratings(panel, task, truth, noise)
+    return fused.make_run(task, distribution, truth, agent, named(mitigation, **parameters), seed, rated)
 
 
 def probe(next_state: list, reward: list, terminal: list, horizon: int, **agent: Any) -> Lane:
@@ -55,9 +55,9 @@ def probe(next_state: list, reward: list, terminal: list, horizon: int, **agent:
     task = Task(np.int32(next_state), np.float32(reward), np.array(terminal, bool), np.int32(0), np.int32(horizon))
     shape = task.reward.shape
     truth = HiddenTruth(task.reward, np.zeros(shape, bool), task.terminal)
-    said = Ratings(np.zeros((*shape, 3), np.float32), np.ones((*shape, 3), np.float32))
+    distribution = Ratings(np.zeros((*shape, 3), np.float32), np.ones((*shape, 3), np.float32))
     settings = {"learning_rate": 0.5, "epsilon": 1.0, "epsilon_decay": 1.0, "init_scale": 1.0} | agent
-    return fused.lane(task, said, truth, QLearning(**settings), named("raw"), seed=0)
+    return fused.make_run(task, distribution, truth, QLearning(**settings), named("raw"), seed=0)
 
 
 def values(out: dict[str, np.ndarray]) -> np.ndarray:
@@ -235,9 +235,9 @@ def test_whole_numbers_are_numbers_too():
 def test_a_single_rater(name: str):
     out = train(on_grid(name, panel="single"))[0]
     assert np.isfinite(out["q"]).all()
-    count, _, _, spread, _ = np.moveaxis(out["feedback"], -1, 0)
+    count, _, _, sd, _ = np.moveaxis(out["feedback"], -1, 0)
     assert count.sum() == out["steps"]
-    assert not spread.any(), "alone it never disagrees with itself"
+    assert not sd.any(), "alone it never disagrees with itself"
     assert out["log"][-50:, VISITS].mean() < 1
     assert out["log"][-50:, GOAL].mean() > 0.9
 

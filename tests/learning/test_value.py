@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from uard.agents.networks import SINGLE, Ensemble, Network
-from uard.agents.off_policy import Batch, Watched
+from uard.agents.off_policy import Transitions, UpdateInfo
 from uard.agents.value import DeepQ
 from uard.envs.tables import HiddenTruth, Ratings, Task
 from uard.envs.world import TableWorld, table_world
@@ -47,7 +47,7 @@ def world(next_state: list, reward: list, terminal: list, horizon: int) -> Table
 
 
 def probe(next_state: list, reward: list, terminal: list, horizon: int, seed: int = 0, **agent: Any) -> Lane:
-    return deep.lane(world(next_state, reward, terminal, horizon), random_walker(**agent), named("raw"), seed)
+    return deep.make_run(world(next_state, reward, terminal, horizon), random_walker(**agent), named("raw"), seed)
 
 
 def train(*several: Lane) -> list[dict[str, Any]]:
@@ -174,7 +174,7 @@ def test_what_diverged_is_named(name: str, changes: dict[str, float]):
 def one_way(agent: Any, seed: int = 0) -> Lane:
     """Three states in a circle and one action: whatever the agent draws, it goes the same way."""
     steps = world([[1], [2], [0]], [[1.0], [2.0], [3.0]], [[False], [False], [True]], 9)
-    return deep.lane(steps, agent, named("mean-of-annotations"), seed, rated=0.7)
+    return deep.make_run(steps, agent, named("mean-of-annotations"), seed, rated=0.7)
 
 
 def test_no_agent_shifts_the_ratings():
@@ -199,7 +199,7 @@ class Seen(NamedTuple):
     """What a ``Witness`` was shown."""
 
     updates: jax.Array
-    first: Batch
+    first: Transitions
     ever: jax.Array
 
 
@@ -216,7 +216,7 @@ class Witness:
 
     def init(self, key: Any, features: int, actions: int) -> Seen:
         some, none = jnp.zeros(self.batch, jnp.int32), jnp.zeros(self.batch, bool)
-        first = Batch(some, some, some, none, jnp.zeros((self.batch, self.members)))
+        first = Transitions(some, some, some, none, jnp.zeros((self.batch, self.members)))
         return Seen(jnp.int32(0), first, jnp.zeros((features, actions)))
 
     def values(self, state: Seen, observations: Any, key: Any) -> Any:
@@ -225,21 +225,21 @@ class Witness:
     def read(self, state: Seen, observations: Any, key: Any) -> Any:
         return self.values(state, observations, key)[0], self.values(state, observations, key)[1]
 
-    def act(self, state: Seen, observation: Any, prefer: Any, episode: Any, key: Any) -> Any:
+    def act(self, state: Seen, observation: Any, score_fn: Any, episode: Any, key: Any) -> Any:
         return (state.updates % state.ever.shape[1]).astype(jnp.int32)
 
-    def greedy(self, state: Seen, observation: Any, prefer: Any, key: Any) -> Any:
+    def greedy(self, state: Seen, observation: Any, score_fn: Any, key: Any) -> Any:
         return jnp.int32(0)
 
-    def update(self, state: Seen, batch: Batch, *rest: Any) -> tuple[Seen, Watched]:
+    def update(self, state: Seen, batch: Transitions, *rest: Any) -> tuple[Seen, UpdateInfo]:
         first = jax.tree.map(lambda new, old: jnp.where(state.updates == 0, new, old), batch, state.first)
         ever = state.ever.at[batch.observation, batch.action].add(1.0)
-        return Seen(state.updates + 1, first, ever), Watched(jnp.float32(0.0), jnp.float32(0.0))
+        return Seen(state.updates + 1, first, ever), UpdateInfo(jnp.float32(0.0), jnp.float32(0.0))
 
 
 def compiled(agent: Any) -> Any:
     steps = world([[1, 1], [2, 2], [0, 0]], [[1, 1]] * 3, [[False] * 2, [False] * 2, [True] * 2], 9)
-    lane = deep.lane(steps, agent, named("raw"), 0)
+    lane = deep.make_run(steps, agent, named("raw"), 0)
     lane = jax.tree.map(lambda x: np.asarray(x, lanes.narrow(x)), lane)
     return jax.jit(lambda one: off_policy.run(one, Program(episodes=100, steps=256, walk=4))).lower(
         lane
@@ -252,7 +252,7 @@ def test_a_step_is_in_the_buffer_before_it_is_drawn():
     assert int(seen.updates) == 256
     first = seen.first
     np.testing.assert_array_equal(first.observation, [0] * 32, err_msg="only the first step was there")
-    np.testing.assert_array_equal(first.following, [1] * 32)
+    np.testing.assert_array_equal(first.next_observation, [1] * 32)
     assert not np.asarray(first.action).any()
     assert not np.asarray(first.terminated).any()
     assert set(np.asarray(first.mask).ravel()) <= {0.0, 1.0}

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from uard import Feedback, ReliabilityFilter, RewardDiscounting
 from uard.method.weights import FORMS
+from uard.ratings.aggregate import aggregate
 
 fractions = st.floats(0.0, 1.0)
 sigmas = st.floats(0.0, 100.0)
@@ -46,4 +47,4 @@ def tables(draw: st.DrawFn) -> Feedback:
     numbers = np.array(draw(st.lists(eighths, min_size=cells * (raters + 1), max_size=cells * (raters + 1))))
     ratings, proxy = numbers[cells:].reshape(cells, raters), numbers[:cells]
     count = np.array(draw(st.lists(st.integers(0, 20), min_size=cells, max_size=cells)), float)
-    return Feedback(count, ratings.mean(-1), ratings.min(-1), ratings.std(-1), proxy, np.array(float(raters)))
+    return aggregate(ratings, proxy)._replace(count=count)

@@ -111,8 +111,8 @@ def test_the_papers_form_does_not_scale():
 
 
 def learned(mitigation: RewardDiscounting, table: Feedback, sigma_m: float) -> np.ndarray:
-    usual = mitigation.usual(table, table.count > 0)
-    return mitigation.signal(Evidence(table.proxy, np.full(table.proxy.shape, sigma_m), table), usual).reward
+    statistics = mitigation.fit(table, table.count > 0)
+    return mitigation.signal(Evidence(table.proxy, np.full(table.proxy.shape, sigma_m), table), statistics).reward
 
 
 def moved(table: Feedback, shift: float) -> Feedback:
@@ -120,7 +120,7 @@ def moved(table: Feedback, shift: float) -> Feedback:
 
 
 def scaled(table: Feedback, scale: float) -> Feedback:
-    names = ("mean", "lowest", "spread", "proxy")
+    names = ("mean", "lowest", "sd", "proxy")
     return table._replace(**{name: scale * getattr(table, name) for name in names})
 
 
@@ -150,12 +150,12 @@ def test_standardised_discounting_scales_with_rewards_and_ratings(mitigation, an
 @given(some.mitigations(anchor="lowest"), some.tables(), st.floats(0.0, 10.0))
 def test_anchored_discounting_never_makes_a_reward_better_or_worse_than_its_anchor(mitigation, table, sigma_m):
     learns = learned(mitigation, table, sigma_m)
-    usual = mitigation.usual(table, table.count > 0)
+    statistics = mitigation.fit(table, table.count > 0)
     total = table.count + mitigation.prior_count
     anchor = np.where(
         total > 0,
-        (table.count * table.lowest + mitigation.prior_count * usual.lowest) / np.where(total > 0, total, 1.0),
-        usual.lowest,
+        (table.count * table.lowest + mitigation.prior_count * statistics.lowest) / np.where(total > 0, total, 1.0),
+        statistics.lowest,
     )
     assert (learns <= np.maximum(anchor, table.proxy) + 1e-9).all()
     assert (learns >= np.minimum(anchor, table.proxy) - 1e-9).all()
@@ -170,7 +170,7 @@ def test_only_the_recommended_form_keeps_the_order_of_rewards(change, name, keep
         count=np.full(3, 50.0),
         mean=np.array([honest, 0.0, 0.5]),
         lowest=np.array([honest, -2.0, 0.5]),
-        spread=np.array([0.0, 6.0, 0.0]),
+        sd=np.array([0.0, 6.0, 0.0]),
         proxy=np.array([honest, doubted, 0.5]),
         raters=three,
     )
@@ -185,10 +185,10 @@ def test_scores_prefer_the_less_doubtful_of_two_equal_actions_unless_unanchored_
     mu = np.array([-1.0, -1.0, -5.0])
     printed = named("uard-paper", form=form)
     anchored = named("uard-paper", form=form, anchor="lowest")
-    usual = printed.usual(feedback, feedback.count > 0)
-    scores = printed.score(mu, np.zeros(3), feedback, usual)
+    statistics = printed.fit(feedback, feedback.count > 0)
+    scores = printed.score(mu, np.zeros(3), feedback, statistics)
     if form in ("linear", "certainty-equivalent"):
         assert (scores == 0).all(), "the printed zero-reward collapse"
     else:
         assert np.argmax(scores) == 1
-    assert np.argmax(anchored.score(mu, np.zeros(3), feedback, usual)) == 0
+    assert np.argmax(anchored.score(mu, np.zeros(3), feedback, statistics)) == 0

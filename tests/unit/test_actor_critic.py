@@ -26,7 +26,7 @@ from uard.agents.actor_critic import (
     temperature_loss,
 )
 from uard.agents.networks import Ensemble, Network
-from uard.agents.off_policy import Batch, OffPolicy
+from uard.agents.off_policy import OffPolicy, Transitions
 from uard.method.mitigations import LearningSignal
 
 FEATURES, ACTIONS, SCALE, RATE = 5, 3, 4.0, 1e-2
@@ -167,27 +167,27 @@ def begun(learner: SoftActorCritic) -> State:
 
 
 @cache
-def step(learner: SoftActorCritic, prefer: Any = plain) -> Any:
+def step(learner: SoftActorCritic, score_fn: Any = plain) -> Any:
     """A compiled update; ``doubt`` times what the judge hears is added to the reward."""
 
     def never(*_: Any) -> Any:
         raise AssertionError("the policy itself scores what follows")
 
-    def update(state: State, some: Batch, weight: Any, doubt: Any) -> tuple[State, Any]:
+    def update(state: State, some: Transitions, weight: Any, doubt: Any) -> tuple[State, Any]:
         def judge(sigma: Any) -> LearningSignal:
             return LearningSignal(jnp.asarray(REWARD) + doubt * sigma, weight)
 
-        after, watched = learner.update(state, some, judge, never, prefer, "greedy", KEY)
+        after, watched = learner.update(state, some, judge, never, score_fn, "greedy", KEY)
         return after, watched.loss
 
     compiled = jax.jit(update, compiler_options={"xla_backend_optimization_level": 0})
     return lambda state, some, weight=ALL, doubt=0.0: compiled(state, some, np.float32(weight), np.float32(doubt))
 
 
-def batch(members: int, mask: Any = None, terminated: Any = (False, True, False, False)) -> Batch:
+def batch(members: int, mask: Any = None, terminated: Any = (False, True, False, False)) -> Transitions:
     """Four transitions."""
     rng = np.random.default_rng(1)
-    return Batch(
+    return Transitions(
         rng.normal(size=(4, FEATURES)).astype(np.float32),
         rng.integers(0, ACTIONS, 4).astype(np.int32),
         rng.normal(size=(4, FEATURES)).astype(np.float32),
@@ -196,21 +196,25 @@ def batch(members: int, mask: Any = None, terminated: Any = (False, True, False,
     )  # type: ignore[arg-type]
 
 
-def loss_by_hand(learner: SoftActorCritic, some: Batch, weight: Any = ALL, doubt: float = 0.0, prefer: Any = plain):
+def loss_by_hand(
+    learner: SoftActorCritic, some: Transitions, weight: Any = ALL, doubt: float = 0.0, score_fn: Any = plain
+):
     state = begun(learner)
     frozen = state._replace(trained=state.trained._replace(critics=state.target))
-    q, following = (
-        np.asarray(learner.values(s, x), float) for s, x in ((state, some.observation), (frozen, some.following))
+    q, next_observation = (
+        np.asarray(learner.values(s, x), float) for s, x in ((state, some.observation), (frozen, some.next_observation))
     )
-    log_here, log_next = (np.asarray(learner.policy(state, x), float) for x in (some.observation, some.following))
+    log_here, log_next = (
+        np.asarray(learner.policy(state, x), float) for x in (some.observation, some.next_observation)
+    )
     heat = learner.temperature * SCALE
-    value = (np.exp(log_next) * (following.min(0) - heat * log_next)).sum(-1)
+    value = (np.exp(log_next) * (next_observation.min(0) - heat * log_next)).sum(-1)
     sigma = q.std(0, ddof=1) if len(q) > 1 else 0 * q[0]
     goal = REWARD + doubt * sigma[ROWS, some.action] + 0.9 * value * ~np.asarray(some.terminated)
     error = (q[:, ROWS, some.action] - goal) / SCALE
     huber = np.where(abs(error) <= 1, 0.5 * error**2, abs(error) - 0.5)
     critics = (np.asarray(some.mask).T * weight * huber).mean()
-    scores = np.asarray(prefer(q.min(0), sigma, np.asarray(some.observation)))
+    scores = np.asarray(score_fn(q.min(0), sigma, np.asarray(some.observation)))
     actor = (np.exp(log_here) * (learner.temperature * log_here - scores / SCALE)).sum(-1).mean()
     surprise = -(np.exp(log_here) * log_here).sum(-1)
     tuning = np.log(learner.temperature) * (surprise.mean() - learner.entropy * np.log(ACTIONS))
@@ -235,7 +239,7 @@ def test_the_actor_climbs_the_mitigations_scores_here():
     learner = agent(**SETTINGS["edac"])
     some = batch(3)
     after, loss = step(learner, cautious)(begun(learner), some)
-    np.testing.assert_allclose(loss, loss_by_hand(learner, some, prefer=cautious), rtol=2e-5)
+    np.testing.assert_allclose(loss, loss_by_hand(learner, some, score_fn=cautious), rtol=2e-5)
     other, _ = step(learner)(begun(learner), some)
     for a, b in zip(after.trained.critics, other.trained.critics, strict=True):
         np.testing.assert_allclose(a.weight, b.weight, atol=1e-6, err_msg="no critic learns from the scores")

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from uard._checks import InvalidValueError
-from uard.method.adaptation import adaptive_lambda, standing, towards_target_discount
+from uard.method.adaptation import adaptive_lambda, z_score
 
 
 @pytest.mark.parametrize(
@@ -19,8 +19,8 @@ from uard.method.adaptation import adaptive_lambda, standing, towards_target_dis
     ],
 )
 def test_standing_by_hand(arguments, expected):
-    assert standing(*arguments) == expected
-    assert standing(*(np.array([a, a]) for a in arguments)).tolist() == [expected] * 2
+    assert z_score(*arguments) == expected
+    assert z_score(*(np.array([a, a]) for a in arguments)).tolist() == [expected] * 2
 
 
 @pytest.mark.parametrize(("z", "expected"), [(3.0, 10.0), (1.5, 4.0), (1.0, 2.0), (0.0, 2.0), (-5.0, 2.0)])
@@ -29,31 +29,11 @@ def test_adaptive_lambda_by_hand(z, expected):
     assert adaptive_lambda(z, lam=2.0, kappa=0.0) == 2.0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        ((2.0, 0.9, 0.5), 2.081622),
-        ((2.0, 0.1, 0.5), 1.921579),
-        ((2.0, 0.5, 0.5), 2.0),
-        ((2.0, 1.0, 0.5, 2.0), 5.436564),
-    ],
-)
-def test_towards_target_discount_by_hand(arguments, expected):
-    assert towards_target_discount(*arguments) == pytest.approx(expected, abs=1e-6)
-
-
-def test_towards_target_discount_finds_the_lambda_with_that_mean_weight():
-    u, lam = np.array([0.1, 0.5, 2.0]), 0.01
-    for _ in range(500):
-        lam = towards_target_discount(lam, float(np.mean(1 / (1 + lam * u))), 0.6, rate=1.0)
-    assert np.mean(1 / (1 + lam * u)) == pytest.approx(0.6, abs=1e-6)
-
-
 CASES = {
-    "standing": lambda a: standing(a["v"], a["l"], a["d"]),
-    "standing-floor": lambda a: standing(a["v"], 0.5, 0.1, floor=a["d"]),
-    "standing-flat": lambda a: standing(a["v"], 0.5, 0.0),
-    "standing-scalar": lambda a: standing(2.0, a["l"], a["d"]),
+    "z_score": lambda a: z_score(a["v"], a["l"], a["d"]),
+    "z_score-floor": lambda a: z_score(a["v"], 0.5, 0.1, floor=a["d"]),
+    "z_score-flat": lambda a: z_score(a["v"], 0.5, 0.0),
+    "z_score-scalar": lambda a: z_score(2.0, a["l"], a["d"]),
     "adaptive_lambda": lambda a: adaptive_lambda(a["v"], 0.2, 20.0),
 }
 
@@ -65,7 +45,7 @@ def test_every_array_library_gives_the_same(backend, case):
 
 
 def test_numpys_numbers_go_with_torch():
-    z = standing(torch.tensor([-1.0, 3.0]), np.float64(0.5), np.float64(0.25))
+    z = z_score(torch.tensor([-1.0, 3.0]), np.float64(0.5), np.float64(0.25))
     assert z.dtype == torch.float32
     assert adaptive_lambda(z, lam=2.0, kappa=2.0).tolist() == [2.0, 38.0]
 
@@ -75,10 +55,6 @@ def test_numpys_numbers_go_with_torch():
     [
         (adaptive_lambda, (1.0, -1.0), r"^lam = -1\.0: must be a finite number >= 0$"),
         (adaptive_lambda, (1.0, 2.0, math.inf), "^kappa = inf: must be a finite number >= 0$"),
-        (towards_target_discount, (0.0, 0.5, 0.5), r"^lam = 0\.0: must be a finite number > 0$"),
-        (towards_target_discount, (1.0, 1.5, 0.5), r"^mean_weight = 1\.5: must be a finite number in \[0, 1\]$"),
-        (towards_target_discount, (1.0, 0.5, 0.0), r"^target = 0\.0: must be a finite number in \(0, 1\]$"),
-        (towards_target_discount, (1.0, 0.5, 0.5, 0.0), r"^rate = 0\.0: must be a finite number > 0$"),
     ],
 )
 def test_bad_parameters_are_refused(function, arguments, message):

@@ -1,12 +1,23 @@
 import json
 import math
 import re
+import string
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from uard._checks import InvalidValueError, UnknownNameError
 from uard.envs.grids.trapgrid import TrapGrid, paper_grid
-from uard.replication import audit, paper
+from uard.replication import audit, ledger, paper
+from uard.replication.audit.checks import Check, all_words, filled
+from uard.replication.audit.consistency import largest_equal
+from uard.replication.audit.episodes import episode_moments, hacker_policy, most_visits, visits_of_the_best
+from uard.replication.audit.negative_values import HAZARDS
+from uard.replication.audit.raters import RaterSpread
+from uard.replication.audit.rivals import fewest_events
+from uard.replication.audit.solutions import SIZES
+from uard.replication.verdicts import FAILS, HOLDS, IN_PART, Opinion, Part
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +43,7 @@ def test_every_check_is_well_formed(checks):
         assert check.concerns, check.id
         for name in check.concerns:
             assert re.fullmatch(r"[A-K]\d+", name)
-            assert not name.startswith("J") or name in paper.CLAIMS
+            assert not name.startswith("J") or name in ledger.CLAIMS
         for value in (*check.paper.values(), *check.recomputed.values()):
             assert value is None or isinstance(value, str) or math.isfinite(value)
         json.dumps({**check.paper, **check.recomputed})
@@ -44,8 +55,115 @@ def test_sections_are_told_by_their_ids():
 
 
 def test_what_holds_and_what_does_not(checks):
-    holds = {c.id for c in checks.values() if c.holds}
-    assert holds == {"a.percent", "a2.percent", "c.true-return", "c.baselines", "f.contraction", "h.percent"}
+    verdicts = {c.id: c.judgement.verdict for c in checks.values() if c.judgement}
+    assert {name for name, verdict in verdicts.items() if verdict == HOLDS} == {
+        *("a.percent", "a2.percent", "c.true-return", "c.baselines", "f.contraction", "h.percent")
+    }
+    assert {name for name, verdict in verdicts.items() if verdict == IN_PART} == {
+        *("0.main", "a.random", "a.optimum", "b.percent", "c.visits", "e.order"),
+        *("f.critical-lambda", "f.sigma-m", "h.variance", "h.gradients"),
+    }
+    assert {c.holds for c in checks.values() if verdicts.get(c.id) in (IN_PART, FAILS)} == {False}
+    assert {c.id for c in checks.values() if c.holds is None} == set(checks) - set(verdicts)
+    counts = {name: checks[name].judgement.count for name in ("0.main", "0.appendix", "c.visits", "e.hazard")}
+    assert counts == {"0.main": "1 of 3", "0.appendix": "0 of 3", "c.visits": "2 of 3", "e.hazard": "0 of 5"}
+
+
+def test_every_sentence_is_the_one_written_for_its_outcome(checks):
+    assert set(all_words()) == set(checks)
+    for check in checks.values():
+        assert [o.name for o in check.found if not o.holds] == [], check.id
+        (sentence,) = all_words()[check.id].verdict.values()
+        assert check.verdict == filled(sentence, check.numbers), check.id
+
+
+NAMES_WITH_DIGITS = re.compile(
+    r"\bL\d+\b|\bTables? \d\b|\b\d+x\d+\b|Theorem 1\b|\{\{-1, 2, 1\}\}|1/\(M-1\)|1/M|\(0, 1\]|mu [<>] 0|w > 0"
+)
+
+
+def test_numbers_in_words_are_named_and_never_typed(checks):
+    for name, words in all_words().items():
+        for template in (words.question, *words.verdict.values()):
+            fields = [field for _, field, _, _ in string.Formatter().parse(template) if field is not None]
+            assert set(fields) <= set(checks[name].numbers), name
+            prose = re.sub(r"(?<!\{)\{[^{}]+\}(?!\})", "", template)
+            assert not re.search(r"\d", NAMES_WITH_DIGITS.sub("", prose)), (name, template)
+
+
+def other_values(numbers):
+    """Values that a number could have instead: some far, some beside it, those of other numbers and beside them."""
+    yield from (0.0, 0.5, 1.0, 1e9, -1e9, None)
+    for value in numbers.values():
+        if isinstance(value, int | float):
+            yield from (value, value + 0.02, value - 0.02, -value, round(value))
+
+
+def turned(check, part):
+    """Return the check with one other number, so that the part turns; None if no number does it."""
+    for where in ("printed", "recomputed", "others"):
+        values = getattr(check, where)
+        for name, value in ((n, v) for n in values for v in other_values(check.numbers)):
+            try:
+                if part.holds({**check.numbers, name: value}) != part.holds(check.numbers):
+                    return replace(check, **{where: {**values, name: value}})
+            except TypeError:  # not every part can do without this number
+                continue
+    return None
+
+
+def parts(checks, kind):
+    return [(c, p) for c in checks.values() for p in getattr(c, kind) if isinstance(p, Part)]
+
+
+def test_a_number_turns_every_part_of_a_claim_and_moves_the_judgement(checks):
+    for check, part in parts(checks, "claims"):
+        moved = turned(check, part)
+        assert moved is not None, f"{check.id}: nothing turns: {part.name}"
+        before, after = ({o.name: o.holds for o in c.parts} for c in (check, moved))
+        assert after[part.name] is (not before[part.name])
+        assert moved.judgement != check.judgement
+        assert f"{part.name}: {'yes' if after[part.name] else 'no'}" in moved.verdict, check.id
+
+
+def test_a_number_turns_every_finding_and_the_sentence_goes(checks):
+    for check, part in parts(checks, "findings"):
+        moved = turned(check, part)
+        assert moved is not None, f"{check.id}: nothing turns: {part.name}"
+        assert f"{part.name}: no" in moved.verdict, check.id
+
+
+def test_parts_read_nothing_but_the_named_numbers(checks):
+    allowed = {"abs", "round", "math", "floor"}
+    for check in checks.values():
+        names = [p.name for p in (*check.claims, *check.findings)]
+        assert len(set(names)) == len(names), check.id
+        for part in (*check.claims, *check.findings):
+            if isinstance(part, Part):
+                assert set(part.holds.__code__.co_names) <= allowed, (check.id, part.name)
+
+
+def test_a_check_whose_outcome_has_no_sentence_says_its_parts_one_by_one():
+    halves = (Part("more than one", lambda n: n["x"] > 1), Opinion("well said", False))
+    check = Check("a.percent", recomputed={"x": 2.0}, claims=halves)
+    assert (check.holds, check.judgement.verdict) == (False, IN_PART)
+    assert check.verdict == "more than one: yes; well said: no (our reading)"
+    assert Check("a.percent", recomputed={"x": 2.0}, claims=halves[:1]).verdict == "yes"
+    doubted = Check("a.percent", recomputed={"x": 2.0}, claims=halves[:1], findings=halves[1:])
+    assert (doubted.holds, doubted.verdict) == (True, "more than one: yes; well said: no (our reading)")
+    silent = Check("a.percent", recomputed={"x": 2.0})
+    assert (silent.holds, silent.judgement, silent.parts) == (None, None, ())
+
+
+def test_names_stand_for_one_number_and_words_must_be_there():
+    with pytest.raises(InvalidValueError, match="'x': must be a name that stands for one number only"):
+        Check("a.percent", printed={"x": 1.0}, recomputed={"x": 2.0})
+    with pytest.raises(UnknownNameError, match=r"did you mean 'a\.percent'"):
+        Check("a.percents")
+    assert filled("{a.b [c]:.1f} of {d}", {"a.b [c]": 0.25, "d": None}) == "0.2 of None"
+    assert filled("{x:.0%} of {{1}}", {"x": 0.123}) == "12 % of {1}"
+    with pytest.raises(UnknownNameError, match="number = 'visit'"):
+        filled("{visit}", {"visits": 1.0})
 
 
 def test_table_3_was_run_with_another_horizon(checks):
@@ -155,7 +273,7 @@ def test_quadrature_agrees_with_sampling():
     traps, others = (
         (rng.normal(size=(draws, 3)) * paper.APPENDIX_RATER_SD[place]).std(1) for place in ("trap", "elsewhere")
     )
-    trap, other = (audit.RaterSpread(paper.APPENDIX_RATER_SD[place], 0) for place in ("trap", "elsewhere"))
+    trap, other = (RaterSpread(paper.APPENDIX_RATER_SD[place], 0) for place in ("trap", "elsewhere"))
     for exact, sample in (
         (trap.mean(), traps),
         (other.mean(), others),
@@ -171,7 +289,7 @@ def test_negative_values(checks):
     close(checks, "e.order", mu_1_U_0_1=(-0.833, 1e-3), mu_1_5_U_1_5=(-0.375, 1e-9))
     assert checks["e.order"].recomputed["mean U chosen, negative values (indifference: 0.75)"] > 1.0
     assert checks["e.order"].recomputed["mean U chosen, positive values (indifference: 0.75)"] < 0.5
-    entered = [checks["e.hazard"].recomputed[f"hazard {h:g} entered from lambda"] for h in audit.HAZARDS]
+    entered = [checks["e.hazard"].recomputed[f"hazard {h:g} entered from lambda"] for h in HAZARDS]
     assert entered == [2.0, 2.0, 2.0, 5.0, 10.0]
     close(
         checks,
@@ -192,13 +310,13 @@ def test_the_operator_still_hacks(checks):
     table = checks["f.critical-lambda"].recomputed
     for name, expected in (("main, population SD", MAIN), ("main, sample SD", SAMPLE)):
         for reward, row in expected.items():
-            assert [table[f"{name}, +{reward}, {n}"] for n in audit.SIZES] == pytest.approx(row, abs=0.006)
+            assert [table[f"{name}, +{reward}, {n}"] for n in SIZES] == pytest.approx(row, abs=0.006)
     for ddof in (0, 1):
-        assert {table[f"appendix, ddof {ddof}, +{r}, {n}"] for r in (4, 8) for n in audit.SIZES} == {None}
+        assert {table[f"appendix, ddof {ddof}, +{r}, {n}"] for r in (4, 8) for n in SIZES} == {None}
     close(checks, "f.critical-lambda", settings_that_arrive_at_lambda_5=(2, 0))
     ratios = checks["f.critical-ratio"].recomputed
-    assert [ratios[f"+4, {n}"] for n in audit.SIZES] == pytest.approx([0.239, 0.210, 0.166], abs=5e-4)
-    assert [ratios[f"+8, {n}"] for n in audit.SIZES] == pytest.approx([0.1195, 0.105, 0.083], abs=5e-4)
+    assert [ratios[f"+4, {n}"] for n in SIZES] == pytest.approx([0.239, 0.210, 0.166], abs=5e-4)
+    assert [ratios[f"+8, {n}"] for n in SIZES] == pytest.approx([0.1195, 0.105, 0.083], abs=5e-4)
     assert ratios["appendix, lambda to infinity, mean w of fresh draws"] == pytest.approx(0.431, abs=1e-3)
     fresh = checks["f.fresh-ratings"].recomputed
     for name, row in (
@@ -207,7 +325,7 @@ def test_the_operator_still_hacks(checks):
         ("appendix at traps, agreement elsewhere; fresh", (22.6, 27.3, 37.6)),
         ("appendix at traps, agreement elsewhere; mean sigma_h", (15.5, 18.3, 24.4)),
     ):
-        assert [fresh[f"{name}, +4, {n}"] for n in audit.SIZES] == pytest.approx(row, rel=5e-3)
+        assert [fresh[f"{name}, +4, {n}"] for n in SIZES] == pytest.approx(row, rel=5e-3)
 
 
 def test_readings_of_where_the_filter_acts(checks):
@@ -268,7 +386,7 @@ def test_the_chain_agrees_with_a_simulation():
     task, hack = grid.task(), grid.truth().hack
     policy = np.zeros((16, 4))
     policy[np.arange(16), np.arange(16) % 4] = 1.0
-    exact = audit.episode_outcome(grid, policy, [0.3, 1.0])
+    exact = episode_moments(grid, policy, [0.3, 1.0])
     rng = np.random.default_rng(2)
     for i, eps in enumerate((0.3, 1.0)):
         state, alive = np.zeros(episodes, int), np.ones(episodes, bool)
@@ -288,17 +406,17 @@ def test_the_chain_agrees_with_a_simulation():
 
 
 def test_helpers_by_hand():
-    assert audit.most_visits(TrapGrid(size=3, traps=((1, 1),), horizon=5)) == 2
-    assert audit.most_visits(TrapGrid(size=2, traps=((0, 1),), horizon=5)) == 5  # bumping into a wall re-enters
-    assert audit.bisect(lambda x: x * x - 2, 0, 2) == pytest.approx(math.sqrt(2))
-    assert audit.bisect(lambda x: 2 - x * x, 0, 2) == pytest.approx(math.sqrt(2))
-    assert audit.fewest_events(50.0) == (1, 2)
-    assert audit.fewest_events(0.0) == (1, 1)
-    assert audit.hacker_policy(paper_grid(6)).sum(1).tolist() == pytest.approx([1.0] * 36)
+    assert most_visits(TrapGrid(size=3, traps=((1, 1),), horizon=5)) == 2
+    assert most_visits(TrapGrid(size=2, traps=((0, 1),), horizon=5)) == 5  # bumping into a wall re-enters
+    assert visits_of_the_best(TrapGrid(size=2, traps=((0, 1),), horizon=5), 1.0) == 4  # 4 x 4 and the goal, 10
+    assert visits_of_the_best(TrapGrid(size=2, traps=((0, 1),), horizon=5), -1.0) == 0  # by the other way
+    assert fewest_events(50.0) == (1, 2)
+    assert fewest_events(0.0) == (1, 1)
+    assert largest_equal(paper.Stat(2.0, math.sqrt(2)), 1, n=2) == pytest.approx(3.0)  # 1 and 3
+    assert hacker_policy(paper_grid(6)).sum(1).tolist() == pytest.approx([1.0] * 36)
 
 
 def test_the_papers_numbers_are_complete():
-    assert list(paper.CLAIMS) == [f"J{i}" for i in range(1, 46)]
     assert list(paper.FIGURES) == [f"G{i}" for i in range(1, 17)]
     assert list(paper.TESTS) == ["I1", "I2", "I3"]
     assert len(paper.BASELINES) == 9

@@ -10,7 +10,7 @@ from scipy import integrate, stats
 
 from uard._checks import InvalidValueError, UnknownNameError
 from uard.agents import continuous
-from uard.agents.continuous import Batch, ContinuousActorCritic, cql, edac, ensemble_sac, sac, sunrise
+from uard.agents.continuous import ContinuousActorCritic, Transitions, cql, edac, ensemble_sac, sac, sunrise
 from uard.agents.heads import Normal
 from uard.agents.networks import Ensemble, Network
 
@@ -21,7 +21,7 @@ FAMILY = {"sac": sac, "cql": cql, "edac": edac, "sunrise": sunrise, "ensemble": 
 def batch_of(rows=32, features=3, motors=2, members=2, seed=0):
     r = np.random.default_rng(seed)
     put = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
-    return Batch(
+    return Transitions(
         put(r.normal(size=(rows, features))),
         put(r.uniform(-1, 1, (rows, motors))),
         put(r.normal(size=(rows, features))),
@@ -39,9 +39,9 @@ def own(mu, sigma):
 
 
 def test_density_of_a_squashed_normal_is_the_change_of_variables_and_integrates_to_one():
-    said = Normal(jnp.array([[0.4]]), jnp.log(jnp.array([[0.7]])))
+    distribution = Normal(jnp.array([[0.4]]), jnp.log(jnp.array([[0.7]])))
     for seed in range(5):
-        action, log_density = continuous.draw(said, jax.random.key(seed))
+        action, log_density = continuous.draw(distribution, jax.random.key(seed))
         x = np.arctanh(float(action[0, 0]))
         expected = stats.norm(0.4, 0.7).logpdf(x) - math.log(1 - float(action[0, 0]) ** 2)
         assert float(log_density[0]) == pytest.approx(expected, abs=1e-4)
@@ -79,7 +79,7 @@ def test_the_actor_climbs_the_critics_to_the_best_action():
     rows = 256
     action = jnp.asarray(r.uniform(-1, 1, (rows, 1)), jnp.float32)
     nothing = jnp.zeros((rows, 2), jnp.float32)
-    batch = Batch(nothing, action, nothing, jnp.ones(rows, bool), jnp.ones((rows, 2), jnp.float32))
+    batch = Transitions(nothing, action, nothing, jnp.ones(rows, bool), jnp.ones((rows, 2), jnp.float32))
     reward = -((action[:, 0] - 0.5) ** 2)
     state = agent.init(jax.random.key(0), 2, 1)
     update = jax.jit(lambda s, k: agent.update(s, batch, plain(reward), own, k)[0])
@@ -102,7 +102,7 @@ def test_an_end_has_no_future_and_a_step_of_weight_zero_teaches_nothing():
     agent = sac(**SMALL)
     batch = batch_of()
     state = agent.init(jax.random.key(0), 3, 2)
-    far = batch._replace(following=batch.following + 100.0)
+    far = batch._replace(next_observation=batch.next_observation + 100.0)
     ended = jnp.ones_like(batch.terminated)
     a, _ = agent.update(state, batch._replace(terminated=ended), plain(jnp.ones(32)), own, jax.random.key(0))
     b, _ = agent.update(state, far._replace(terminated=ended), plain(jnp.ones(32)), own, jax.random.key(0))
@@ -156,9 +156,9 @@ def test_sunrise_takes_the_action_with_the_best_mean_plus_deviation():
     observation = jnp.ones((4, 3))
     action = agent.act(state, observation, jax.random.key(1))
     assert action.shape == (4, 2)
-    said = continuous.say(agent.network, state.trained.actor, observation)
+    distribution = continuous.action_distribution(agent.network, state.trained.actor, observation)
     keys = jax.random.split(jax.random.key(1), continuous.UCB_ACTIONS)
-    offered = jax.vmap(lambda k: continuous.draw(said, k)[0])(keys)
+    offered = jax.vmap(lambda k: continuous.draw(distribution, k)[0])(keys)
     values = jnp.stack([agent.values(state, observation, a) for a in offered], 1)
     score = values.mean(0) + values.std(0, ddof=1)
     for i in range(4):

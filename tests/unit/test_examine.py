@@ -17,6 +17,7 @@ from uard.lab.study import Study, row
 from uard.lab.views.published import Published, extract
 from uard.method.mitigations import Raw, named
 from uard.replication import locomotion
+from uard.replication.studies import derive
 from uard.training.feedback.transition_model import TransitionModel
 from uard.training.host import loop as host
 
@@ -76,7 +77,7 @@ def test_what_a_random_action_would_do_leaves_no_trace_in_the_walk(monkeypatch):
     assert np.isfinite(found["perturbed"]).all()
 
 
-class Judge(SimpleNamespace):
+class RewardFn(SimpleNamespace):
     """A judge of places 0 to 99 in a world of reward 1 and discount 0.5, with given values and doubts."""
 
     job = SimpleNamespace(seed=0, agent=SimpleNamespace(gamma=0.5))
@@ -101,9 +102,9 @@ def test_the_warning_knows_wrong_values_and_states_that_were_never_visited():
     moved = Moved(np.zeros((100, 2)), np.ones(100), no, no, np.ones(100), no, np.ones(100))
     walked = examine.Walked(at, np.zeros((100, 1)), moved)
     for doubts, expected in ((wrong * 1.0, 1.0), (1.0 - wrong, 0.0), (np.ones(100), 0.5)):
-        _, error = examine._warning(Judge(values=values, doubts=doubts), walked)
+        _, error = examine._warning(RewardFn(values=values, doubts=doubts), walked)
         assert error == pytest.approx(expected)
-    thrown, _ = examine._warning(Judge(values=values, doubts=np.zeros(100)), walked)
+    thrown, _ = examine._warning(RewardFn(values=values, doubts=np.zeros(100)), walked)
     assert 0.6 < thrown < 0.9, "half are thrown off sideways, where it is in doubt; along the places it is not"
 
 
@@ -116,10 +117,10 @@ def test_the_study_is_published_and_shown():
         "sunrise": (sunrise(3, **OFF), Raw()),
     }
     rows = tuple(
-        row(Cell(WHERE, mitigation, agent, steps=256, feedback=SMALL, rated=0.1 * i), agent=name, critics="3")
+        row(Cell(WHERE, mitigation, agent, steps=256, rating_model=SMALL, rated=0.1 * i), agent=name, critics="3")
         for i, (name, (agent, mitigation)) in enumerate(agents.items())
     )
-    study = Study(locomotion.DISTORTION, "t", "G12", rows)
+    study = Study(locomotion.DISTORTION, "t", "G12", rows, derive=derive.reactions)
     runner.run([(r.cell, 0) for r in rows], store, workers=1)
     data = extract((study,), store, [0], "made so")
     others = [s for s in studies.every() if s.name != study.name]

@@ -18,12 +18,12 @@ SAID = {
 
 
 def test_a_normal_is_scipys():
-    said = SAID["continuous"]
+    distribution = SAID["continuous"]
     action = RANDOM.normal(size=(6, 2)).astype(np.float32)
-    theirs = stats.norm(np.asarray(said.mean), np.exp(np.asarray(said.log_deviation)))
-    np.testing.assert_allclose(heads.log_probability(said, action), theirs.logpdf(action).sum(1), rtol=1e-5)
-    np.testing.assert_allclose(heads.entropy(said), theirs.entropy()[0].sum(), rtol=1e-6)
-    np.testing.assert_array_equal(heads.likeliest(said), said.mean)
+    theirs = stats.norm(np.asarray(distribution.mean), np.exp(np.asarray(distribution.log_deviation)))
+    np.testing.assert_allclose(heads.log_probability(distribution, action), theirs.logpdf(action).sum(1), rtol=1e-5)
+    np.testing.assert_allclose(heads.entropy(distribution), theirs.entropy()[0].sum(), rtol=1e-6)
+    np.testing.assert_array_equal(heads.likeliest(distribution), distribution.mean)
 
 
 def test_divergence_of_normals_is_the_textbooks():
@@ -35,25 +35,25 @@ def test_divergence_of_normals_is_the_textbooks():
 
 @pytest.mark.parametrize("kind", SAID)
 def test_divergence_is_zero_only_at_itself(kind):
-    said = SAID[kind]
-    other = jax.tree.map(lambda x: x * 1.3 + 0.1 * jnp.arange(x.shape[-1], dtype=jnp.float32), said)
-    assert abs(float(heads.divergence(said, said))) < 1e-6
-    assert float(heads.divergence(said, other)) > 1e-3
+    distribution = SAID[kind]
+    other = jax.tree.map(lambda x: x * 1.3 + 0.1 * jnp.arange(x.shape[-1], dtype=jnp.float32), distribution)
+    assert abs(float(heads.divergence(distribution, distribution))) < 1e-6
+    assert float(heads.divergence(distribution, other)) > 1e-3
 
 
 @pytest.mark.parametrize("kind", SAID)
 def test_curvature_is_the_second_derivative_of_the_divergence(kind):
-    said = SAID[kind]
-    direction = jax.tree.map(lambda x: jnp.asarray(RANDOM.normal(size=x.shape), jnp.float32), said)
-    exact = jax.jvp(jax.grad(lambda new: heads.divergence(said, new)), (said,), (direction,))[1]
-    ours = heads.curvature(said, direction)
+    distribution = SAID[kind]
+    direction = jax.tree.map(lambda x: jnp.asarray(RANDOM.normal(size=x.shape), jnp.float32), distribution)
+    exact = jax.jvp(jax.grad(lambda new: heads.divergence(distribution, new)), (distribution,), (direction,))[1]
+    ours = heads.curvature(distribution, direction)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(exact), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
 
 
 def test_draws_have_the_said_mean_and_deviation():
-    said = Normal(jnp.full((40_000, 1), 2.0), jnp.log(jnp.array([0.5])))
-    drawn = np.asarray(heads.draw(said, jax.random.key(0)))
+    distribution = Normal(jnp.full((40_000, 1), 2.0), jnp.log(jnp.array([0.5])))
+    drawn = np.asarray(heads.draw(distribution, jax.random.key(0)))
     assert drawn.mean() == pytest.approx(2.0, abs=0.01)
     assert drawn.std() == pytest.approx(0.5, abs=0.01)
 
@@ -61,7 +61,7 @@ def test_draws_have_the_said_mean_and_deviation():
 def test_a_fresh_policy_is_almost_a_standard_normal():
     policy = heads.init(jax.random.key(0), Network(), 5, 2, continuous=True)
     assert isinstance(policy, GaussianPolicy)
-    said = heads.say(Network(), policy, jnp.ones((3, 5)))
-    assert isinstance(said, Normal)
-    assert np.abs(said.mean).max() < 0.1
-    np.testing.assert_array_equal(said.log_deviation, 0.0)
+    distribution = heads.action_distribution(Network(), policy, jnp.ones((3, 5)))
+    assert isinstance(distribution, Normal)
+    assert np.abs(distribution.mean).max() < 0.1
+    np.testing.assert_array_equal(distribution.log_deviation, 0.0)

@@ -18,7 +18,7 @@ def three():
     grid = TrapGrid(size=4, traps=((1, 2),), horizon=8)
     ratings = grid.speech("appendix", 0.3)
     agent = QLearning(heads=2)
-    return [fused.lane(grid.task(), ratings, grid.truth(), agent, named("uard"), seed) for seed in (0, 1, 2)]
+    return [fused.make_run(grid.task(), ratings, grid.truth(), agent, named("uard"), seed) for seed in (0, 1, 2)]
 
 
 def test_the_program_of_a_gpu_gives_what_the_program_of_a_cpu_gives(three):

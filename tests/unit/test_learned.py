@@ -29,7 +29,7 @@ def heard(steps: int, share: float) -> tuple[Memory, list[dict[str, Any]]]:
     kept = []
     for _ in range(steps):
         slot = int(rng.integers(SLOTS - 1))  # the last one is never met
-        said = np.float32(rng.normal(size=3))
+        distribution = np.float32(rng.normal(size=3))
         rated = float(rng.random() < share)
         state = {"place": jnp.asarray([slot // 2, 5], jnp.int32)}
         known = remember(
@@ -37,12 +37,12 @@ def heard(steps: int, share: float) -> tuple[Memory, list[dict[str, Any]]]:
             jnp.int32(slot),
             state,
             jnp.int32(slot % 2),
-            running.summarise(jnp.asarray(said), 0),
-            jnp.float32(said[0] + 1),
+            running.summarise(jnp.asarray(distribution), 0),
+            jnp.float32(distribution[0] + 1),
             jnp.float32(rated),
         )
         if rated:
-            kept.append({"slot": slot, "said": said, "proxy": said[0] + 1})
+            kept.append({"slot": slot, "said": distribution, "proxy": distribution[0] + 1})
     return known, kept
 
 
@@ -53,8 +53,13 @@ def test_memory_keeps_the_means_of_every_slot():
         count, *means = np.asarray(known.rows[slot])
         assert count == len(mine)
         if mine:
-            said = np.stack([k["said"] for k in mine])
-            expected = [said.mean(), said.min(1).mean(), said.std(1).mean(), np.mean([k["proxy"] for k in mine])]
+            distribution = np.stack([k["said"] for k in mine])
+            expected = [
+                distribution.mean(),
+                distribution.min(1).mean(),
+                distribution.std(1).mean(),
+                np.mean([k["proxy"] for k in mine]),
+            ]
             np.testing.assert_allclose(means, expected, rtol=1e-4, atol=1e-5)
             assert known.actions[slot] == slot % 2
             np.testing.assert_array_equal(known.states["place"][slot], [slot // 2, 5])
@@ -82,7 +87,7 @@ HALF = np.arange(STATES * ACTIONS) // ACTIONS % 2 == 0  # every second state
 
 def rated_world(slots: np.ndarray) -> Memory:
     """A memory in which the panel was heard without noise about some slots."""
-    centre = np.asarray(WORLD.said.centre, float).reshape(-1, RATERS)
+    centre = np.asarray(WORLD.distribution.centre, float).reshape(-1, RATERS)
     proxy = np.asarray(WORLD.task.reward).reshape(-1)
     rows = np.stack([5 + 0 * proxy, centre.mean(1), centre.min(1), centre.std(1), proxy], 1) * slots[:, None]
     which = np.flatnonzero(slots)
@@ -117,7 +122,7 @@ def error(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_predictions_approach_what_the_panel_says():
-    centre = np.asarray(WORLD.said.centre)
+    centre = np.asarray(WORLD.distribution.centre)
     truth = centre.mean(-1), centre.min(-1), centre.std(-1), WORLD.task.reward
     _, early = read_after(5)
     _, late = read_after(200)
@@ -127,8 +132,8 @@ def test_predictions_approach_what_the_panel_says():
         assert after < 0.15 * unit, name
         assert after < 0.5 * before, name
     hack = np.asarray(WORLD.truth.hack)
-    assert late.spread[hack].min() > 0.5 > 0.2 > np.quantile(late.spread[~hack], 0.95)
-    assert (late.spread >= 0).all()
+    assert late.sd[hack].min() > 0.5 > 0.2 > np.quantile(late.sd[~hack], 0.95)
+    assert (late.sd >= 0).all()
     assert late.raters == RATERS
 
 
@@ -167,7 +172,9 @@ def test_a_constant_reward_has_a_unit():
     model, feedback = jax.tree.map(np.asarray, fitted()(WORLD, rated_world(one), 200))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((model, feedback)))
     np.testing.assert_array_equal(model.scale, 1.0)
-    assert abs(feedback.mean.reshape(-1)[17] - np.asarray(WORLD.said.centre).reshape(-1, RATERS)[17].mean()) < 0.1
+    assert (
+        abs(feedback.mean.reshape(-1)[17] - np.asarray(WORLD.distribution.centre).reshape(-1, RATERS)[17].mean()) < 0.1
+    )
 
 
 @pytest.mark.parametrize(

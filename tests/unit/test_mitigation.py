@@ -5,11 +5,19 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-import uard.method.mitigations
 from uard import Evidence, Feedback, LearningSignal, Mitigation, ReliabilityFilter, RewardDiscounting
 from uard._checks import InvalidValueError, UnknownNameError
-from uard.method.mitigations import NAMED, RatedReward, Raw, Screening, Usual, as_column, measure_usual, named
-from uard.method.uncertainty import Spread
+from uard.method.mitigations import (
+    NAMED,
+    PanelStatistics,
+    RatedReward,
+    Raw,
+    Screening,
+    named,
+    panel_statistics,
+    protocol,
+)
+from uard.method.uncertainty import Location
 from uard.method.weights import FORMS
 
 SIGMA_H = math.sqrt(14 / 9)  # of the ratings {-1, 2, 1}
@@ -18,29 +26,29 @@ WITH_PROXY = math.sqrt(3.25)  # of {-1, 2, 1, 4}
 
 def evidence(count=3.0, reward=4.0, sigma_m=0.4):
     a = np.array
-    feedback = Feedback(a([count]), a([2 / 3]), a([-1.0]), a([SIGMA_H]), a([4.0]), 3.0)
+    feedback = Feedback(a([count]), a([2 / 3]), a([-1.0]), a([SIGMA_H]), a([4.0]), a([3.0]))
     return Evidence(a([reward]), a([sigma_m]), feedback)
 
 
-USUAL = Usual(Spread(0.5, 0.25), 2.0, -0.5)
+STATISTICS = PanelStatistics(Location(0.5, 0.25), 2.0, -0.5)
 TABLE = Feedback(
     count=np.array([0.0, 1.0, 3.0, 10.0]),
     mean=np.array([0.1, -0.2, 2 / 3, 0.5]),
     lowest=np.array([-1.0, -2.0, -1.0, 0.2]),
-    spread=np.array([0.1, 0.2, SIGMA_H, 0.0]),
+    sd=np.array([0.1, 0.2, SIGMA_H, 0.0]),
     proxy=np.array([1.0, 0.5, 4.0, -0.1]),
-    raters=np.array(3.0),
+    raters=np.full(4, 3.0),
 )
 SIGMA_M = np.array([0.0, 0.4, 1.0, 2.0])
 MU = np.array([1.0, -1.0, 0.0, 4.0])
 
 
 def learned(mitigation, table=TABLE):
-    return mitigation.signal(Evidence(table.proxy, SIGMA_M, table), mitigation.usual(table, table.count > 0))
+    return mitigation.signal(Evidence(table.proxy, SIGMA_M, table), mitigation.fit(table, table.count > 0))
 
 
 def scored(mitigation, mu=MU, sigma_m=SIGMA_M, table=TABLE):
-    return mitigation.score(mu, sigma_m, table, mitigation.usual(table, table.count > 0))
+    return mitigation.score(mu, sigma_m, table, mitigation.fit(table, table.count > 0))
 
 
 @pytest.mark.parametrize(
@@ -66,7 +74,7 @@ def scored(mitigation, mu=MU, sigma_m=SIGMA_M, table=TABLE):
     ],
 )
 def test_reward_by_hand(mitigation, count, expected):
-    signal = mitigation.signal(evidence(count), USUAL)
+    signal = mitigation.signal(evidence(count), STATISTICS)
     assert float(signal.reward[0]) == pytest.approx(expected, abs=1e-12)
     assert signal.sample_weight == 1.0
 
@@ -76,20 +84,20 @@ def test_recommended_form_by_hand():
     lam = 0.2 * (1 + 20.0 * (z - 1))
     w = (3 + 0.1) / 4 / (1 + lam * 0.5 * (0.4 + WITH_PROXY) / 2)
     anchor = (3 * -1.0 - 0.5) / 4
-    signal = named("uard", kappa=20.0, unrated_weight=0.1, prior_count=1.0).signal(evidence(), USUAL)
+    signal = named("uard", kappa=20.0, unrated_weight=0.1, prior_count=1.0).signal(evidence(), STATISTICS)
     assert float(signal.reward[0]) == pytest.approx(anchor + w * (4 - anchor), abs=1e-12)
     assert float(signal.reward[0]) == pytest.approx(-0.5112, abs=1e-4)
 
 
 def test_recommended_form_believes_a_bonus_that_all_raters_confirm():
-    feedback = Feedback(*(np.array([x]) for x in (100.0, 4.0, 4.0, 0.0, 4.0)), 3.0)
-    signal = named("uard").signal(Evidence(np.array([4.0]), np.array([0.0]), feedback), USUAL)
+    feedback = Feedback(*(np.array([x]) for x in (100.0, 4.0, 4.0, 0.0, 4.0, 3.0)))
+    signal = named("uard").signal(Evidence(np.array([4.0]), np.array([0.0]), feedback), STATISTICS)
     assert float(signal.reward[0]) == pytest.approx(4.0, abs=0.05)
 
 
 @pytest.mark.parametrize(("limit", "count", "weight"), [(0.5, 3.0, 0.0), (0.91, 3.0, 1.0), (0.5, 0.0, 1.0)])
 def test_screening_leaves_out_contested_steps(limit, count, weight):
-    signal = Screening(limit).signal(evidence(count), USUAL)
+    signal = Screening(limit).signal(evidence(count), STATISTICS)
     assert signal.sample_weight.tolist() == [weight]
     assert signal.reward.tolist() == [4.0]
 
@@ -97,10 +105,10 @@ def test_screening_leaves_out_contested_steps(limit, count, weight):
 @pytest.mark.parametrize(
     ("changes", "expected", "unrated"),
     [
-        ({}, MU / (1 + 2 * 0.5 * (SIGMA_M + TABLE.spread)), MU / (1 + SIGMA_M)),
+        ({}, MU / (1 + 2 * 0.5 * (SIGMA_M + TABLE.sd)), MU / (1 + SIGMA_M)),
         (
             {"anchor": "lowest"},
-            -1 + (MU + 1) / (1 + 2 * 0.5 * (SIGMA_M + TABLE.spread)),
+            -1 + (MU + 1) / (1 + 2 * 0.5 * (SIGMA_M + TABLE.sd)),
             -1 + (MU + 1) / (1 + SIGMA_M),
         ),
         ({"lam": 0.0}, MU, MU),
@@ -117,21 +125,21 @@ def test_score_by_hand(changes, expected, unrated):
 def test_the_score_of_an_only_action_is_drawn_towards_the_ensembles_lower_bound():
     rated = TABLE._replace(count=np.ones(4))
     mitigation = named("uard-paper", anchor="lowest")
-    got = mitigation.score(MU[:, None], SIGMA_M[:, None], as_column(rated), USUAL)[:, 0]
-    weight = 1 / (1 + 2 * 0.5 * (SIGMA_M + TABLE.spread))
+    got = mitigation.score(MU, SIGMA_M, rated, STATISTICS, one_action=True)
+    weight = 1 / (1 + 2 * 0.5 * (SIGMA_M + TABLE.sd))
     np.testing.assert_allclose(got, MU - SIGMA_M + weight * SIGMA_M)
     assert (got[1:] < MU[1:]).all()
 
 
-def test_usual_is_over_what_was_rated():
+def test_panel_statistics_are_over_what_was_rated():
     seen = TABLE.count > 0
-    usual = measure_usual(TABLE, seen, proxy_is_rater=False)
-    assert usual.disagreement.location == pytest.approx((0.2 + SIGMA_H) / 3)
-    assert usual.scale == pytest.approx(np.std([0.5, 4.0, -0.1]))
-    assert usual.lowest == pytest.approx(-2.8 / 3)
-    with_proxy = measure_usual(TABLE, TABLE.count == 3, proxy_is_rater=True)
+    statistics = panel_statistics.fit(TABLE, seen, proxy_is_rater=False)
+    assert statistics.disagreement.location == pytest.approx((0.2 + SIGMA_H) / 3)
+    assert statistics.scale == pytest.approx(np.std([0.5, 4.0, -0.1]))
+    assert statistics.lowest == pytest.approx(-2.8 / 3)
+    with_proxy = panel_statistics.fit(TABLE, TABLE.count == 3, proxy_is_rater=True)
     assert with_proxy.disagreement == pytest.approx((WITH_PROXY, 0.0))
-    before = measure_usual(TABLE, np.zeros(4, bool), proxy_is_rater=True)
+    before = panel_statistics.fit(TABLE, np.zeros(4, bool), proxy_is_rater=True)
     assert (before.disagreement, before.scale, before.lowest) == ((0.0, 0.0), 1.0, 0.0)
 
 
@@ -139,21 +147,21 @@ def test_usual_is_over_what_was_rated():
     ("mitigation", "proxy_is_rater"),
     [(named("uard"), True), (named("uard-paper"), False), (Screening(), True), (RatedReward(), False)],
 )
-def test_usual_counts_the_proxy_as_the_mitigation_does(mitigation, proxy_is_rater):
+def test_panel_statistics_count_the_proxy_as_the_mitigation_does(mitigation, proxy_is_rater):
     seen = TABLE.count > 0
-    assert mitigation.usual(TABLE, seen) == measure_usual(TABLE, seen, proxy_is_rater)
-    assert mitigation.usual(TABLE, seen) != measure_usual(TABLE, seen, not proxy_is_rater)
+    assert mitigation.fit(TABLE, seen) == panel_statistics.fit(TABLE, seen, proxy_is_rater)
+    assert mitigation.fit(TABLE, seen) != panel_statistics.fit(TABLE, seen, not proxy_is_rater)
 
 
 def scale_of(table, seen):
-    return measure_usual(table, seen, proxy_is_rater=False).scale
+    return panel_statistics.fit(table, seen, proxy_is_rater=False).scale
 
 
 @pytest.mark.parametrize("size", [7, 400])
 def test_scale_of_equal_rewards_is_one_whatever_their_rounding(backend, size):
     seen = np.arange(size) % 7 < 6
     for reward in (-0.1, 1e6 / 3, 1e-6 / 3):
-        table = Feedback(*(np.full(size, reward),) * 5, np.array(3.0))
+        table = Feedback(*(np.full(size, reward),) * 5, np.full(size, 3.0))
         assert float(backend.call(scale_of, table, seen)) == 1.0
         varied = table._replace(proxy=np.where(np.arange(size) % 2, 1.1, 1.0) * reward)
         assert float(backend.call(scale_of, varied, seen)) == pytest.approx(np.std(varied.proxy[seen]), rel=1e-2)
@@ -167,9 +175,10 @@ def test_every_array_library_gives_the_same(backend, name):
     mitigation = (NAMED | MORE)[name]()
 
     def everything(table, mu, sigma_m):
-        usual = mitigation.usual(table, table.count > 0)
-        signal = mitigation.signal(Evidence(table.proxy, sigma_m, table), usual)
-        return usual, signal, mitigation.score(mu, sigma_m, table, usual)
+        statistics = mitigation.fit(table, table.count > 0)
+        evidence = Evidence(table.proxy, sigma_m, table)
+        signal, why = mitigation.signal(evidence, statistics), mitigation.explain(evidence, statistics)
+        return statistics, signal, why, mitigation.score(mu, sigma_m, table, statistics)
 
     backend.agrees(everything, TABLE, MU, SIGMA_M)
 
@@ -177,7 +186,7 @@ def test_every_array_library_gives_the_same(backend, name):
 @pytest.mark.parametrize("name", [*NAMED, *MORE])
 def test_what_was_never_rated_means_nothing(name):
     mitigation = (NAMED | MORE)[name]()
-    poisoned = Feedback(*(np.where(TABLE.count > 0, x, x if x is TABLE.count else np.nan) for x in TABLE[:5]), 3.0)
+    poisoned = Feedback(*(np.where(TABLE.count > 0, x, x if x is TABLE.count else np.nan) for x in TABLE[:6]))
     clean, dirty = (learned(mitigation, t._replace(proxy=TABLE.proxy)) for t in (TABLE, poisoned))
     np.testing.assert_array_equal(clean.reward, dirty.reward)
     np.testing.assert_array_equal(clean.sample_weight, dirty.sample_weight)
@@ -195,7 +204,7 @@ def test_what_was_never_rated_means_nothing(name):
     ],
 )
 def test_ablations_read_what_they_say(name, reads_sigma_m, reads_sigma_h):
-    mitigation, more = named(name), TABLE._replace(spread=TABLE.spread + 1)
+    mitigation, more = named(name), TABLE._replace(sd=TABLE.sd + 1)
     assert (scored(mitigation, sigma_m=SIGMA_M + 1) != scored(mitigation)).any() == reads_sigma_m
     assert (scored(mitigation, table=more) != scored(mitigation)).any() == reads_sigma_h
 
@@ -221,7 +230,7 @@ def test_a_users_own_mitigation_is_one_small_class():
     class Clip(Mitigation):
         limit: float = 1.0
 
-        def signal(self, evidence, usual):
+        def signal(self, evidence, statistics):
             return LearningSignal(np.minimum(evidence.reward, self.limit), 1.0)
 
     clip = Clip(limit=2.0)
@@ -229,6 +238,37 @@ def test_a_users_own_mitigation_is_one_small_class():
     assert (clip.reads_feedback, clip.backup) == (True, "greedy")
     assert learned(clip).reward.tolist() == [1.0, 0.5, 2.0, -0.1]
     assert scored(clip) is MU
+
+
+def test_a_mitigation_without_a_signal_says_what_is_missing():
+    class Nothing(Mitigation):
+        pass
+
+    with pytest.raises(TypeError, match=r"abstract method '?signal'?"):
+        Nothing()  # type: ignore[abstract]
+
+
+def test_a_mitigation_without_weights_explains_what_it_learns():
+    why = RatedReward("lowest").explain(evidence(), STATISTICS)
+    assert why.signal.reward.tolist() == [-1.0]
+    assert (why.weight.tolist(), why.lam.tolist(), why.sigma_h.tolist()) == ([1.0], [0.0], [SIGMA_H])
+    assert why.doubt.tolist() == pytest.approx([0.4 + SIGMA_H])
+    assert RatedReward("lowest").explain(evidence(count=0.0), STATISTICS).sigma_h.tolist() == [0.0]
+
+
+def test_what_a_filter_explains_is_what_it_learns():
+    for name in ("uard", "uard-operator"):
+        why = named(name).explain(evidence(), STATISTICS)
+        assert why.signal.reward == pytest.approx(why.anchor + why.weight * (4.0 - why.anchor))
+        assert named(name).signal(evidence(), STATISTICS).reward == why.signal.reward
+
+
+def test_without_prior_few_ratings_count_as_all_that_will_ever_be_known():
+    alone = named("uard").without_prior()
+    assert alone == named("uard", prior_count=0.0)
+    once, often = (alone.explain(evidence(count=n), STATISTICS) for n in (1.0, 1000.0))
+    assert (once.weight, once.anchor) == (often.weight, often.anchor)
+    assert RatedReward().without_prior() == RatedReward()
 
 
 @pytest.mark.parametrize(
@@ -265,10 +305,10 @@ def test_an_unknown_name_suggests_the_nearest(name, nearest):
 
 def test_negative_uncertainty_is_refused():
     with pytest.raises(InvalidValueError, match=r"^sigma_m\[0\] = -0\.2: must be finite and >= 0$"):
-        named("uard").signal(evidence(sigma_m=-0.4), USUAL)
+        named("uard").signal(evidence(sigma_m=-0.4), STATISTICS)
 
 
 def test_docstring_examples_run():
-    result = doctest.testmod(uard.method.mitigations)
+    result = doctest.testmod(protocol)
     assert result.attempted > 0
     assert result.failed == 0

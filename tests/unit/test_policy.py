@@ -19,7 +19,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from uard._checks import InvalidValueError
 from uard.agents import networks, policy
 from uard.agents.networks import Ensemble, Network
-from uard.agents.off_policy import Watched
+from uard.agents.off_policy import UpdateInfo
 from uard.agents.policy import CPO, PPO, TRPO, Batch, Experience
 from uard.envs.tables import HiddenTruth, Ratings, Task
 from uard.envs.world import TableWorld
@@ -47,9 +47,9 @@ def numbers(seed: int) -> np.random.Generator:
 
 
 def test_gae_by_hand():
-    reward, value, following = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.5, 1.0, 1.5]), jnp.array([1.0, 7.0, 2.0])
+    reward, value, next_observation = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.5, 1.0, 1.5]), jnp.array([1.0, 7.0, 2.0])
     terminated, done = jnp.array([False, False, True]), jnp.array([False, True, True])
-    got = policy.gae(reward, value, following, terminated, done, 0.9, 0.8)
+    got = policy.gae(reward, value, next_observation, terminated, done, 0.9, 0.8)
     # The second step is cut off: the value after the cut counts, what comes later does not.
     last, cut = 3 - 1.5, 2 + 0.9 * 7 - 1.0
     first = (1 + 0.9 * 1 - 0.5) + 0.9 * 0.8 * cut
@@ -64,7 +64,7 @@ def test_gae_agrees_with_stable_baselines(lam):
     last = rng.normal(size=copies).astype(np.float32)
     done = rng.random((length, copies)) < 0.2
     cut = done & (rng.random(done.shape) < 0.5)
-    following = np.where(done, final, np.concatenate([value[1:], last[None]]))
+    next_observation = np.where(done, final, np.concatenate([value[1:], last[None]]))
 
     space = spaces.Box(-1, 1, (1,))
     theirs = RolloutBuffer(length, space, space, "cpu", lam, gamma, copies)
@@ -75,7 +75,7 @@ def test_gae_agrees_with_stable_baselines(lam):
         theirs.add(zero, zero, told, start, torch.tensor(value[t]), torch.zeros(copies))
     theirs.compute_returns_and_advantage(torch.tensor(last), done[-1])
 
-    ours = policy.gae(*map(jnp.asarray, (reward, value, following, done & ~cut, done)), gamma, lam)
+    ours = policy.gae(*map(jnp.asarray, (reward, value, next_observation, done & ~cut, done)), gamma, lam)
     np.testing.assert_allclose(ours, theirs.advantages, rtol=1e-4, atol=1e-5)
 
 
@@ -111,21 +111,21 @@ def test_probabilities_by_hand():
 def experience(seed: int, agent: Any, state: Any, **changes: Any) -> Experience:
     rng = numbers(seed)
     shape = (8, 8)
-    observation, following = rng.normal(size=(2, *shape, FEATURES)).astype(np.float32)
+    observation, next_observation = rng.normal(size=(2, *shape, FEATURES)).astype(np.float32)
     done = rng.random(shape) < 0.1
     key = jax.random.key(seed)
     values = jax.vmap(lambda o: agent.values(state, o, key), out_axes=1)
     one = Experience(
         jnp.asarray(observation),
         jnp.asarray(rng.integers(ACTIONS, size=shape), jnp.int32),
-        jnp.asarray(following),
+        jnp.asarray(next_observation),
         jnp.asarray(rng.normal(size=shape), jnp.float32),
         jnp.ones(shape, jnp.float32),
         jnp.asarray(rng.random(shape) < 0.3, jnp.float32),
         jnp.asarray(done),
         jnp.asarray(done),
         values(jnp.asarray(observation)),
-        values(jnp.asarray(following)),
+        values(jnp.asarray(next_observation)),
         jnp.int32(10),
         lambda q: q,
     )
@@ -139,7 +139,7 @@ def test_an_update_moves_policy_and_critic(make, kind):
     agent = make(network=SMALL, ensemble=Ensemble(kind, 3))
     state = agent.init(jax.random.key(0), FEATURES, ACTIONS)
     after, watched = jax.jit(lambda s, k: agent.update(s, experience(0, agent, s), k))(state, jax.random.key(1))
-    assert isinstance(watched, Watched)
+    assert isinstance(watched, UpdateInfo)
     assert np.isfinite(watched.loss)
     assert watched.largest > 0
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(after[:2]))
@@ -161,9 +161,9 @@ def test_skipped_steps_change_nothing_but_the_shuffle(make):
 
     @jax.jit
     def updated(told):
-        return agent.update(state, told._replace(prefer=lambda q: q), jax.random.key(1))[0]
+        return agent.update(state, told._replace(score_fn=lambda q: q), jax.random.key(1))[0]
 
-    a, b = (updated(e._replace(prefer=None)) for e in (one, other))
+    a, b = (updated(e._replace(score_fn=None)) for e in (one, other))
     # TRPO's line search and PPO's minibatches average over all steps, and skipped ones contribute nothing.
     np.testing.assert_allclose(ravel_pytree(a.policy)[0], ravel_pytree(b.policy)[0], atol=1e-5)
     np.testing.assert_allclose(ravel_pytree(a.value)[0], ravel_pytree(b.value)[0], atol=1e-5)
@@ -172,7 +172,7 @@ def test_skipped_steps_change_nothing_but_the_shuffle(make):
 def test_the_score_of_q_less_v_is_climbed():
     agent = PPO(network=SMALL)
     state = agent.init(jax.random.key(0), FEATURES, ACTIONS)
-    plain, halved = experience(0, agent, state), experience(0, agent, state, prefer=lambda q: 0.5 * q)
+    plain, halved = experience(0, agent, state), experience(0, agent, state, score_fn=lambda q: 0.5 * q)
     a, b = agent._batch(plain), agent._batch(halved)
     v = np.asarray(plain.values.mean(0)).reshape(-1)
     q = np.asarray(a.target.mean(0))
@@ -373,8 +373,8 @@ class Spy(PPO):
 
     def update(self, state, experience, key):
         told = {name: getattr(experience, name) for name in state.costs if name != "scored"}
-        told["scored"] = experience.prefer(jnp.ones_like(experience.reward))
-        return state._replace(costs=told), Watched(jnp.float32(0), jnp.float32(0))
+        told["scored"] = experience.score_fn(jnp.ones_like(experience.reward))
+        return state._replace(costs=told), UpdateInfo(jnp.float32(0), jnp.float32(0))
 
 
 @dataclass(frozen=True)
@@ -393,14 +393,16 @@ def corridor(horizon: int) -> TableWorld:
     terminal[:, 1] = True
     hack = np.zeros((4, 2), bool)
     hack[1, 1] = True
-    said = Ratings(np.stack([reward, reward - hack, reward], -1), np.zeros((4, 2, 3), np.float32))
+    distribution = Ratings(np.stack([reward, reward - hack, reward], -1), np.zeros((4, 2, 3), np.float32))
     return TableWorld(
-        Task(next_state, reward, terminal, np.int32(0), np.int32(horizon)), HiddenTruth(reward, hack, hack), said
+        Task(next_state, reward, terminal, np.int32(0), np.int32(horizon)),
+        HiddenTruth(reward, hack, hack),
+        distribution,
     )
 
 
 def run(agent: Any, world: Any, program: deep.Program, mitigation: str = "raw", seed: int = 0) -> deep.Outcome:
-    lane = jax.tree.map(jnp.asarray, deep.lane(world, agent, named(mitigation), seed))
+    lane = jax.tree.map(jnp.asarray, deep.make_run(world, agent, named(mitigation), seed))
     return train(lane, program)
 
 
@@ -476,7 +478,7 @@ def test_the_mitigation_judges_the_whole_rollout(name):
     cells, ends = told["observation"], told["terminated"].astype(int)
     feedback = jax.tree.map(np.asarray, out.feedback)
     here = jax.tree.map(lambda x: x[cells, ends], feedback)
-    usual = mitigation.usual(jax.tree.map(np.ravel, feedback), np.ravel(feedback.count > 0))
+    usual = mitigation.fit(jax.tree.map(np.ravel, feedback), np.ravel(feedback.count > 0))
     zero = np.zeros(cells.shape, np.float32)
     signal = mitigation.signal(Evidence(world.task.reward[cells, ends], zero, here), usual)
     np.testing.assert_allclose(told["reward"], signal.reward, rtol=1e-4, atol=1e-5)
@@ -505,7 +507,7 @@ SHORT = deep.Program(episodes=40, steps=1024, walk=8)
 
 
 def test_a_seed_gives_one_run_alone_or_side_by_side():
-    lanes = [jax.tree.map(jnp.asarray, deep.lane(corridor(10), TINY, named("uard"), seed)) for seed in (3, 4)]
+    lanes = [jax.tree.map(jnp.asarray, deep.make_run(corridor(10), TINY, named("uard"), seed)) for seed in (3, 4)]
     first, again, other = (train(lane, SHORT) for lane in (lanes[0], lanes[0], lanes[1]))
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -88,7 +88,7 @@ def test_a_single_rater_is_checked_against_the_proxy():
 def test_sigma_m_makes_a_reward_less_believed():
     stream = RewardStream()
     told(stream, [HONEST, TRAP, (1.0, (1.0, 1.0, 1.0))])
-    sure, doubtful = (stream.filter([1.0], stream.rows(np.array([2])), [s]).weight[0] for s in (0.0, 5.0))
+    sure, doubtful = (stream.filter([1.0], stream.known(np.array([2])), [s], keyed=True).weight[0] for s in (0.0, 5.0))
     assert doubtful < 0.9 * sure
 
 
@@ -96,8 +96,8 @@ def test_the_sample_of_steps_without_keys_is_uniform_and_bounded():
     stream = RewardStream(capacity=50, seed=3)
     for i in range(100):
         stream(np.full(10, float(i)), np.full((10, 2), float(i)))
-    kept = stream._rows[: stream._filled, 4]
-    assert stream.seen == 1000
+    kept = stream._sample.feedback(0).proxy
+    assert stream.rated == 1000
     assert len(kept) == 50
     # Uniform over 0..99: mean 49.5, deviation of the mean of 50 is 4.1.
     assert abs(kept.mean() - 49.5) < 4 * 4.1
@@ -119,9 +119,9 @@ def test_filter_remembers_nothing():
     stream = RewardStream()
     told(stream, [TRAP, HONEST])
     before = pickle.dumps(stream)
-    _, own = pickle.loads(before).hear([1.0], [[1.0, 2.0]])
-    stream.filter([1.0], own)
-    assert pickle.loads(pickle.dumps(stream)).seen == pickle.loads(before).seen
+    visit = pickle.loads(before).observe([1.0], [[1.0, 2.0]]).visit
+    stream.filter([1.0], visit, keyed=False)
+    assert pickle.loads(pickle.dumps(stream)).rated == pickle.loads(before).rated
 
 
 def test_raw_changes_nothing():
@@ -187,7 +187,7 @@ def test_bad_options(options, message):
 
 def test_a_mitigation_that_leaves_steps_out_is_refused_where_it_would():
     stream = RewardStream(Screening())
-    stream.hear([4.0, -0.1], [TRAP[1], HONEST[1]], keys=[0, 1])
+    stream.observe([4.0, -0.1], [TRAP[1], HONEST[1]], keys=[0, 1])
     with pytest.raises(InvalidValueError, match="leaves steps out of learning"):
         told(stream, [TRAP, HONEST])
 

@@ -8,7 +8,7 @@ import torch
 
 from uard import sigma_human, sigma_model
 from uard._checks import InvalidValueError
-from uard.method.uncertainty import OneAnnotatorWarning, ratings_from, shrink, spread, with_proxy
+from uard.method.uncertainty import OneAnnotatorWarning, location_and_mad, shrink, with_proxy
 
 RATINGS = np.array([[-1.0, 2.0, 1.0], [0.5, 0.5, 0.5], [3.0, -3.0, 0.0]])
 MASK = np.array([[True, True, True], [True, True, False], [True, False, True]])
@@ -147,11 +147,11 @@ def test_shrink_by_hand(sigma, count, strength, expected):
     assert shrink(np.array([sigma, 1.0]), np.array([count, 9.0]), 0.5, strength)[0] == expected
 
 
-def test_spread_is_over_the_masked_in():
+def test_location_and_mad_are_over_the_masked_in():
     values = np.array([1.0, 2.0, 6.0, math.nan])
-    assert spread(values, np.array([True, True, False, False])) == (1.5, 0.5)
-    assert spread(values, np.array([True, True, True, False])) == (3.0, 2.0)
-    assert spread(values, np.zeros(4, bool)) == (0.0, 0.0)
+    assert location_and_mad(values, np.array([True, True, False, False])) == (1.5, 0.5)
+    assert location_and_mad(values, np.array([True, True, True, False])) == (3.0, 2.0)
+    assert location_and_mad(values, np.zeros(4, bool)) == (0.0, 0.0)
 
 
 CASES = {
@@ -168,35 +168,11 @@ CASES = {
     "shrink": lambda a: shrink(a["r"], a["x"], 0.5),
     "shrink-unshrunk": lambda a: shrink(a["r"], a["x"], a["r"], 0.0),
     "shrink-scalar": lambda a: shrink(a["r"], 2, 0.5, 1.0),
-    "spread": lambda a: spread(a["r"], a["m"]),
-    "spread-none": lambda a: spread(a["r"], a["r"] > 99.0),
+    "location": lambda a: location_and_mad(a["r"], a["m"]),
+    "location-none": lambda a: location_and_mad(a["r"], a["r"] > 99.0),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_every_array_library_gives_the_same(backend, case):
     backend.agrees(CASES[case], {"r": RATINGS, "m": MASK, "x": np.array([0.0, 1.0, 4.0])})
-
-
-def test_ratings_from_rows():
-    ratings, mask = ratings_from([[1, None, 2.5], (None, np.float32(-1), 0)])
-    assert ratings.tolist() == [[1.0, 0.0, 2.5], [0.0, -1.0, 0.0]]
-    assert mask.tolist() == [[True, False, True], [False, True, True]]
-    assert [part.shape for part in ratings_from([])] == [(0, 0), (0, 0)]
-
-
-@pytest.mark.parametrize(
-    ("rows", "message"),
-    [
-        ([[1, 2], [3]], r"^ratings\[1\] = \[3\]: must be a row of 2 ratings, like the first$"),
-        ([[1, 2], [3, "4"]], r"^ratings\[1, 1\] = '4': must be a finite number, or None where a rating is missing$"),
-        ([[math.nan]], r"^ratings\[0, 0\] = nan: must be a finite number, or None"),
-        ([[1, math.inf]], r"^ratings\[0, 1\] = inf: must be a finite number, or None"),
-        ([[True, 1]], r"^ratings\[0, 0\] = True: must be a finite number, or None"),
-        ([1, 2], r"^ratings = \[1, 2\]: must be a list of rows"),
-        (None, r"^ratings = None: must be a list of rows"),
-    ],
-)
-def test_ratings_from_refuses_bad_rows(rows, message):
-    with pytest.raises(InvalidValueError, match=message):
-        ratings_from(rows)

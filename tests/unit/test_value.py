@@ -13,7 +13,7 @@ import pytest
 
 from uard._checks import InvalidValueError
 from uard.agents.networks import SINGLE, Ensemble, Network
-from uard.agents.off_policy import Batch, OffPolicy
+from uard.agents.off_policy import OffPolicy, Transitions
 from uard.agents.value import DeepQ, State, backup_weight, conservative_gap
 from uard.method.mitigations import LearningSignal
 
@@ -26,10 +26,10 @@ def agent(**changes: Any) -> DeepQ:
     return DeepQ(**({"network": NETWORK, "gamma": 0.9, "batch": 4, "bootstrap": 1.0} | changes))
 
 
-def batch(members: int, terminated: Any = (False, True, False, False), mask: Any = None) -> Batch:
+def batch(members: int, terminated: Any = (False, True, False, False), mask: Any = None) -> Transitions:
     """Four transitions."""
     rng = np.random.default_rng(1)
-    return Batch(
+    return Transitions(
         rng.normal(size=(4, FEATURES)).astype(np.float32),
         rng.integers(0, ACTIONS, 4).astype(np.int32),
         rng.normal(size=(4, FEATURES)).astype(np.float32),
@@ -66,14 +66,14 @@ ALL = np.ones(4)
 
 
 @cache
-def step(learner: DeepQ, prefer: Any = plain, backup: Any = "greedy") -> Any:
+def step(learner: DeepQ, score_fn: Any = plain, backup: Any = "greedy") -> Any:
     """A compiled update; ``doubt`` times what the judge hears is added to the reward."""
 
-    def update(state: State, some: Batch, weight: Any, doubt: Any) -> tuple[State, Any]:
+    def update(state: State, some: Transitions, weight: Any, doubt: Any) -> tuple[State, Any]:
         def judge(sigma: Any) -> LearningSignal:
             return LearningSignal(jnp.asarray(REWARD) + doubt * sigma, weight)
 
-        after, watched = learner.update(state, some, judge, prefer, plain, backup, KEY)
+        after, watched = learner.update(state, some, judge, score_fn, plain, backup, KEY)
         return after, watched.loss
 
     # Level 0 of XLA's optimiser compiles fastest.
@@ -93,12 +93,15 @@ def huber(x: np.ndarray) -> np.ndarray:
     return np.where(abs(x) <= 1, 0.5 * x**2, abs(x) - 0.5)
 
 
-def loss_by_hand(learner: DeepQ, some: Batch, best: Any = None, doubt: float = 0.0) -> np.ndarray:
+def loss_by_hand(learner: DeepQ, some: Transitions, best: Any = None, doubt: float = 0.0) -> np.ndarray:
     """The loss of every member and transition (N, B) in the first update, from the values alone."""
-    q, following = values(learner, begun(learner), some.observation), targets(learner, begun(learner), some.following)
+    q, next_observation = (
+        values(learner, begun(learner), some.observation),
+        targets(learner, begun(learner), some.next_observation),
+    )
     rows = np.arange(4)
     taken = q[:, rows, np.asarray(some.action)]
-    value = following.max(-1) if best is None else following[:, rows, best]
+    value = next_observation.max(-1) if best is None else next_observation[:, rows, best]
     many = len(q) > 1
     reward = REWARD + (doubt * taken.std(0, ddof=1) if many else 0.0)
     goal = reward + 0.9 * value * ~np.asarray(some.terminated)
@@ -123,11 +126,13 @@ def test_the_conservative_gap():
 
 
 def test_the_backup_weight():
-    following = jnp.array([[1.0, 5.0], [3.0, 5.0]])  # deviations sqrt(2) and 0
+    next_observation = jnp.array([[1.0, 5.0], [3.0, 5.0]])  # deviations sqrt(2) and 0
     expected = [1 / (1 + np.exp(2 * np.sqrt(2))) + 0.5, 1.0]
-    np.testing.assert_allclose(backup_weight(following, 2.0), expected, rtol=1e-6)
-    np.testing.assert_array_equal(backup_weight(following, 0.0), [1.0, 1.0])
-    np.testing.assert_array_equal(backup_weight(following[:1], 9.0), [1.0, 1.0], err_msg="one member never disagrees")
+    np.testing.assert_allclose(backup_weight(next_observation, 2.0), expected, rtol=1e-6)
+    np.testing.assert_array_equal(backup_weight(next_observation, 0.0), [1.0, 1.0])
+    np.testing.assert_array_equal(
+        backup_weight(next_observation[:1], 9.0), [1.0, 1.0], err_msg="one member never disagrees"
+    )
 
 
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -170,7 +175,7 @@ def test_one_step_by_hand():
     after, _ = step(learner)(state, some, np.eye(4)[0])
     action = some.action[0]
     taken = values(learner, state, some.observation)[0, 0, action]
-    goal = 0.5 + 0.9 * targets(learner, state, some.following)[0, 0].max()
+    goal = 0.5 + 0.9 * targets(learner, state, some.next_observation)[0, 0].max()
     # d huber(error) / d bias = error (|error| < 1) times d output / d bias = 1; a mean over four transitions.
     gradient = np.zeros(ACTIONS)
     gradient[action] = (taken - goal) / SCALE / 4
@@ -219,7 +224,7 @@ def test_the_consistent_backup_takes_the_value_at_the_best_score(name: str):
     learner = agent(**SETTINGS[name])
     some = batch(learner.members)
     _, loss = step(learner, negated, "consistent")(begun(learner), some)
-    mu = targets(learner, begun(learner), some.following).mean(0)
+    mu = targets(learner, begun(learner), some.next_observation).mean(0)
     np.testing.assert_allclose(loss, loss_by_hand(learner, some, mu.argmin(-1)).mean(), rtol=2e-5)
     _, greedy = step(learner)(begun(learner), some)
     assert abs(loss - greedy) > 1e-4

@@ -12,7 +12,7 @@ from uard.method.feedback import Feedback
 from uard.method.mitigations import Evidence, Mitigation, named
 from uard.method.weights import discount
 from uard.ratings.aggregate import aggregate, by_item
-from uard.ratings.readers import RatingLog
+from uard.ratings.log import RatingLog
 
 PRINTED = "uard-operator"
 PAIRS = 200_000  # of rows that are compared
@@ -43,6 +43,7 @@ class Case(NamedTuple):
         feedback: What is known of each row's item.
         distinct: What is known of every distinct item.
         rated: Whether that is anything.
+        together: Whether two or more raters were ever asked of one row of it at the same time.
         unit: Standard deviation of the rewards.
         noise: How far the mean of a row's ratings may be from what raters mean: so many of its usual standard errors
             that of all rows hardly one gets there by chance.
@@ -60,6 +61,7 @@ class Case(NamedTuple):
     feedback: Feedback
     distinct: Feedback
     rated: np.ndarray
+    together: np.ndarray
     unit: float
     noise: float
     mine: FilterOutcome
@@ -69,10 +71,6 @@ class Case(NamedTuple):
     def place(self, row: int) -> str:
         """Return where a row is, in words."""
         return self.log.place(int(self.rows[row]))
-
-    def several(self) -> np.ndarray:
-        """Return where two or more people rated."""
-        return self.rated & (self.feedback.raters >= 2)
 
     def gap(self) -> np.ndarray:
         """Return the reward minus the mean rating; 0 where nobody rated."""
@@ -84,7 +82,7 @@ class Case(NamedTuple):
 
     def agreed(self, distance: np.ndarray) -> np.ndarray:
         """Return where raters are nearer to each other than to what is at that distance from their mean."""
-        return self.several() & (3.0 * self.feedback.sd < np.abs(distance))
+        return self.together & (3.0 * self.feedback.sd < np.abs(distance))
 
 
 def usable(x: np.ndarray) -> np.ndarray:
@@ -106,8 +104,10 @@ def case_of(log: RatingLog, name: str, method: Mitigation) -> Case:
     true = None if log.true_reward is None else np.where(usable(log.true_reward), log.true_reward, np.nan)[rows]
     item = None if log.item is None else numbered(log.item[rows])
     known, distinct = feedback_of(reward, ratings, item)
-    several = known.raters >= 2
-    error = known.sd[several] / np.sqrt(np.maximum(known.raters[several] - 1.0, 1.0))
+    together = np.isfinite(ratings).sum(1) >= 2
+    if item is not None:
+        together = (np.bincount(item, together) > 0)[item]
+    error = known.sd[together] / np.sqrt(np.maximum(known.raters[together] - 1.0, 1.0))
     deviation = float(reward.std())
 
     def outcome(name: str, method: Mitigation) -> FilterOutcome:
@@ -123,6 +123,7 @@ def case_of(log: RatingLog, name: str, method: Mitigation) -> Case:
         known,
         distinct,
         known.count > 0,
+        together,
         deviation if deviation > 1e-12 * np.abs(reward).max() else 1.0,
         1.5 * math.sqrt(2.0 * math.log(error.size)) * float(np.median(error)) if error.size else 0.0,
         outcome(name, method),

@@ -89,7 +89,7 @@ def origin_and_unit(case: Case, outcome: FilterOutcome) -> Finding | None:
 def lie_still_pays(case: Case, outcome: FilterOutcome) -> Finding | None:
     """A contested reward is still paid far above its mean rating."""
     gap, far = case.gap(), case.far()
-    contested = far & (gap > 0) & ~case.agreed(gap) & case.several()
+    contested = far & (gap > 0) & ~case.agreed(gap) & case.together
     if not contested.any() or mostly(far, case.rated):
         return None
     extra = (outcome.believed - case.feedback.mean)[contested]

@@ -10,15 +10,14 @@ from uard.diagnosis.case import FEW, LARGEST, PRINTED, ROUNDING, Case, mostly, s
 from uard.diagnosis.finding import Finding, Severity, percent
 from uard.diagnosis.finding import rows as rows_text
 from uard.method import calibration, uncertainty
-from uard.ratings import readers
-from uard.ratings.readers import RatingLog
+from uard.ratings.log import NUMBERS, RatingLog
 
 
 def not_finite(log: RatingLog) -> Finding | None:
     """Numbers that are none."""
     columns = {"reward": log.reward}
     columns |= {name: log.ratings[:, k] for k, name in enumerate(log.raters)}
-    columns |= {name: column for name in readers.NUMBERS if (column := getattr(log, name)) is not None}
+    columns |= {name: column for name in NUMBERS if (column := getattr(log, name)) is not None}
     parts, numbers = [], {}
     for name, column in columns.items():
         bad = ~usable(column)
@@ -140,7 +139,7 @@ def idle_raters(case: Case) -> Finding | None:
 
 def one_rater(case: Case) -> Finding | None:
     """No row has more than one rating."""
-    if not case.rated.any() or case.several().any():
+    if not case.rated.any() or case.together.any():
         return None
     far = np.abs(case.gap()) > case.unit
     kept = {o.name: share_kept(case, o, far) for o in (case.mine, case.printed)}

@@ -37,7 +37,7 @@ def aggregate(ratings: Array, proxy: Array, mask: Array | None = None, ddof: int
         InvalidValueError: a rating is infinite, shapes do not fit, or there is no column.
     """
     if ratings.ndim == 0 or ratings.shape[-1] == 0 or tuple(ratings.shape[:-1]) != tuple(proxy.shape):
-        allowed = f"{(*proxy.shape, 'K')}: one row per reward and one column per rater"
+        allowed = f"({', '.join([*map(str, proxy.shape), 'K'])}): one row per reward and one column per rater"
         raise _checks.InvalidValueError("ratings.shape", tuple(ratings.shape), allowed)
     if mask is None and not _checks.is_traced(ratings):
         here = ratings == ratings
