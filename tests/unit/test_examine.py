@@ -8,7 +8,8 @@ import pytest
 from uard.agents.continuous import edac, sunrise
 from uard.agents.networks import Ensemble, Network
 from uard.agents.policy import PPO
-from uard.envs.locomotion.physics import Locomotion, Moved
+from uard.envs.locomotion.locomotion import Locomotion
+from uard.envs.simulator import StepResult
 from uard.lab import studies
 from uard.lab.cell import Cell
 from uard.lab.execution import examine, runner
