@@ -21,6 +21,7 @@ from uard.replication import locomotion
 from uard.replication.studies import derive
 from uard.training.feedback.transition_model import TransitionModel
 from uard.training.host import loop as host
+from uard.training.host.loops import loop_of
 
 TINY = Network(16, 1e-3, 1.0)
 OFF = {"network": TINY, "batch": 32, "warmup": 64, "buffer": 500}
@@ -30,8 +31,8 @@ WHERE = Locomotion(region=None, reference=True)
 
 
 def trained(agent, mitigation):
-    job = host.Job(WHERE, agent, mitigation, 1, 256, feedback=SMALL, evaluations=1)
-    return job, host.run(job).live
+    loop = loop_of(host.Job(WHERE, agent, mitigation, 1, 256, rating_model=SMALL, evaluations=1))
+    return loop, host.run(loop).state
 
 
 def test_a_reaction_by_hand():
@@ -70,16 +71,16 @@ def test_edac_takes_its_pessimism_off_and_sunrise_weighs():
 
 
 def test_what_a_random_action_would_do_leaves_no_trace_in_the_walk(monkeypatch):
-    job, live = trained(ON, named("uard"))
-    found = examine.examine(job, live)
+    loop, state = trained(ON, named("uard"))
+    found = examine.examine(loop, state)
     monkeypatch.setattr(examine, "EVERY", 250)
-    np.testing.assert_array_equal(found["trace"], examine.examine(job, live)["trace"])
+    np.testing.assert_array_equal(found["trace"], examine.examine(loop, state)["trace"])
     assert (found["trace"][:, examine.TRACE.index("lam")] > 0).all()
     assert np.isfinite(found["perturbed"]).all()
 
 
 class RewardFn(SimpleNamespace):
-    """A judge of places 0 to 99 in a world of reward 1 and discount 0.5, with given values and doubts."""
+    """The filtered rewards of places 0 to 99 in a world of reward 1 and discount 0.5, with given values and doubts."""
 
     job = SimpleNamespace(seed=0, agent=SimpleNamespace(gamma=0.5))
 
@@ -100,8 +101,9 @@ def test_the_warning_knows_wrong_values_and_states_that_were_never_visited():
     values = np.where(wrong, 5.0, 2.0)  # worth 1 / (1 - 0.5) = 2
     at = np.column_stack([places, np.zeros(100)]).astype(float)
     no = np.zeros(100, bool)
-    moved = Moved(np.zeros((100, 2)), np.ones(100), no, no, np.ones(100), no, np.ones(100))
-    walked = examine.Walked(at, np.zeros((100, 1)), moved)
+    one = np.ones(100)
+    result = StepResult(np.zeros((100, 2)), one, no, no, true_reward=one, hack=no, success=no, task_reward=one)
+    walked = examine.Walked(at, np.zeros((100, 1)), result)
     for doubts, expected in ((wrong * 1.0, 1.0), (1.0 - wrong, 0.0), (np.ones(100), 0.5)):
         _, error = examine._warning(RewardFn(values=values, doubts=doubts), walked)
         assert error == pytest.approx(expected)
