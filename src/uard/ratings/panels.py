@@ -1,8 +1,8 @@
 """Panels of raters: what each of K people says of a step.
 
-A simulated rater sees the observed reward (the proxy), the true reward and whether the step is *contested* (one that pays
-for something else than what was meant, such as entering a trap), and answers with a number. In a legitimate twin the
-two rewards agree, but the contested steps stay contested. A panel reads the truth, as people do; the learner gets
+A simulated rater sees the observed reward (the proxy), the true reward and whether the step is *contested* (one that
+pays for something else than what was meant, such as entering a trap), and answers with a number. In a legitimate twin
+the two rewards agree, but the contested steps stay contested. A panel reads the truth, as people do; the learner gets
 nothing but the ratings.
 
 What a panel says of a step is a law, and an answer is drawn from it:
@@ -167,7 +167,8 @@ class Panel:
         low, high = self.low or 0.0, self.high or 0.0
         width = [0.0 if r.stars is None else (high - low) / (r.stars - 1) for r in self.raters]
         columns = [r.lapse for r in self.raters], [r.coverage for r in self.raters], width
-        return Quirks(*(np.array(c, np.float32) for c in columns), np.float32(low), np.float32(high))
+        lapse, coverage, step = (np.array(c, np.float32) for c in columns)
+        return Quirks(lapse, coverage, step, np.float32(low), np.float32(high))
 
 
 def _noise(rater: Rater, proxy: Array, contested: Array, xp: Any) -> Array:
@@ -216,7 +217,7 @@ SINGLE = Panel((Rater(),))
 PANELS: dict[str, Panel] = {"main": MAIN, "appendix": APPENDIX, "colluding": COLLUDING, "single": SINGLE}
 DESCRIPTIONS: dict[str, str] = {
     "main": "One truthful, one tempted, one erratic on contested steps (section 5.8 of the paper).",
-    "appendix": "Three truthful ones with noise of sd 0.1, 0.3 and 0.2, the last 1.0 on contested steps (its appendix).",
+    "appendix": "Three truthful ones with noise of sd 0.1, 0.3 and 0.2, the last 1.0 where contested (its appendix).",
     "colluding": "Three who all repeat the proxy: no method that listens to them can help, a control that must fail.",
     "single": "One truthful rater with sd 0.1, who alone never disagrees with itself.",
 }
