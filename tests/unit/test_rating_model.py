@@ -104,7 +104,9 @@ def rated_world(slots: np.ndarray) -> Memory:
 def fitted() -> Any:
     def fit(world: TableWorld, known: Memory, chunks: Any) -> tuple[Model, Feedback]:
         def once(i: Any, model: Model) -> Model:
-            return rating_model.fit(SPEC, model, known, world.observe, ACTIONS, jax.random.fold_in(jax.random.key(1), i))
+            return rating_model.fit(
+                SPEC, model, known, world.observe, ACTIONS, jax.random.fold_in(jax.random.key(1), i)
+            )
 
         model = rating_model.init(SPEC, jax.random.key(0), STATES, ACTIONS)
         model = jax.lax.fori_loop(0, chunks, once, model)
