@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from uard.method.mitigations import Evidence, Feedback, LearningSignal, Mitigation, RewardDiscounting
     from uard.method.uncertainty import sigma_human, sigma_model
     from uard.method.weights import ReliabilityFilter, discount, total_uncertainty
-    from uard.ratings.readers import RatingLog
+    from uard.ratings.log import RatingLog
 
 _HOME = {
     "InvalidValueError": "_checks",
@@ -26,7 +26,7 @@ _HOME = {
     "Diagnosis": "diagnosis",
     "Finding": "diagnosis",
     "doctor": "diagnosis",
-    "RatingLog": "ratings.readers",
+    "RatingLog": "ratings.log",
     "Evidence": "method.mitigations",
     "Feedback": "method.mitigations",
     "LearningSignal": "method.mitigations",

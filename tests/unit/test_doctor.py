@@ -11,7 +11,7 @@ import uard.envs  # noqa: F401  (registers ids)
 from uard import InvalidValueError, RatingLog, doctor
 from uard.diagnosis import CODES, PRINTED, filtered
 from uard.method.mitigations import named
-from uard.ratings import readers as logs
+from uard.ratings.rollout import rollout
 
 N = 200
 
@@ -259,7 +259,7 @@ def test_every_code_has_a_test():
 )
 def test_panels_of_the_paper(panel, expected):
     with gymnasium.make("uard/TrapGrid6-v0", panel=panel) as env:
-        assert severities(doctor(logs.rollout(env, 1000))) == expected
+        assert severities(doctor(rollout(env, 1000))) == expected
 
 
 def test_items_are_averaged_before_they_are_compared():
@@ -283,7 +283,7 @@ def test_rows_are_named_by_episode_and_step():
 
 def test_the_order_of_rows_does_not_matter():
     with gymnasium.make("uard/TrapGrid6-v0", panel="main") as env:
-        log = logs.rollout(env, 300)
+        log = rollout(env, 300)
     order = np.random.default_rng(0).permutation(300)
     columns = ("reward", "ratings", "true_reward", "item")
     mixed = RatingLog(**{c: getattr(log, c)[order] for c in columns})

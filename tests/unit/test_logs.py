@@ -11,6 +11,8 @@ from pyarrow import parquet
 import uard.envs  # noqa: F401  (registers ids)
 from uard import InvalidValueError, RatingLog
 from uard.ratings import readers as logs
+from uard.ratings.readers import csv_file
+from uard.ratings.rollout import rollout
 
 NAMES = ("reward", "rating_ann", "rating_bob", "sigma_m", "true_reward", "episode", "other")
 ROWS = [
@@ -98,7 +100,7 @@ def test_infinity_and_nan_are_read_as_they_are(tmp_path):
 
 
 def test_chunks_keep_their_row_numbers(tmp_path, monkeypatch):
-    monkeypatch.setattr(logs, "_CHUNK", 10)
+    monkeypatch.setattr(csv_file, "_CHUNK", 10)
     path = tmp_path / "log.csv"
     lines = [f"{i},{i},e{i // 7}" for i in range(95)]
     path.write_text("reward,rating,episode\n" + "\n".join(lines))
@@ -220,7 +222,7 @@ def test_bad_columns(columns, message):
 
 def test_rollouts_are_seeded_and_read_info():
     with gymnasium.make("uard/TrapGrid6-v0", panel="main") as env:
-        a, b, c = (logs.rollout(env, 100, seed) for seed in (0, 0, 1))
+        a, b, c = (rollout(env, 100, seed) for seed in (0, 0, 1))
     assert np.array_equal(a.ratings, b.ratings)
     assert a.reward.tolist() == b.reward.tolist()
     assert not np.array_equal(a.ratings, c.ratings)
@@ -234,7 +236,7 @@ def test_rollouts_are_seeded_and_read_info():
 
 def test_an_environment_without_ratings():
     with gymnasium.make("CartPole-v1") as env:
-        log = logs.rollout(env, 30)
+        log = rollout(env, 30)
     assert log.ratings.shape == (30, 0)
     assert (log.true_reward, log.item, log.sigma_m) == (None, None, None)
 
@@ -266,5 +268,5 @@ class Moody(gymnasium.Env):
 )
 def test_a_rollout_whose_ratings_change(infos, message):
     with pytest.raises(InvalidValueError) as error:
-        logs.rollout(Moody(infos), 2)
+        rollout(Moody(infos), 2)
     assert message in str(error.value)

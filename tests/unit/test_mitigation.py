@@ -244,7 +244,7 @@ def test_a_mitigation_without_a_signal_says_what_is_missing():
     class Nothing(Mitigation):
         pass
 
-    with pytest.raises(TypeError, match="abstract method '?signal'?"):
+    with pytest.raises(TypeError, match=r"abstract method '?signal'?"):
         Nothing()  # type: ignore[abstract]
 
 

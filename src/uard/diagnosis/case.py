@@ -12,7 +12,7 @@ from uard.method.feedback import Feedback
 from uard.method.mitigations import Evidence, Mitigation, named
 from uard.method.weights import discount
 from uard.ratings.aggregate import aggregate, by_item
-from uard.ratings.readers import RatingLog
+from uard.ratings.log import RatingLog
 
 PRINTED = "uard-operator"
 PAIRS = 200_000  # of rows that are compared

@@ -28,7 +28,7 @@ from uard.diagnosis.finding import SEVERITIES, Diagnosis, Finding
 from uard.method.mitigations import Mitigation
 from uard.ratings import readers
 from uard.ratings.agreement import krippendorff_alpha
-from uard.ratings.readers import RatingLog
+from uard.ratings.log import RatingLog
 
 
 def doctor(
@@ -41,7 +41,7 @@ def doctor(
     """Name every known trap that a log of rewards and ratings is in.
 
     Args:
-        log: A ``uard.ratings.readers.RatingLog``; the path of a CSV, JSONL or Parquet file; or named columns. See ``uard.ratings.readers`` for
+        log: A ``uard.ratings.log.RatingLog``; the path of a CSV, JSONL or Parquet file; or named columns. See ``uard.ratings.readers`` for
             the columns.
         mitigation: The filter that is going to be used: the name of one, or a ``Mitigation``.
         reward: Name of the column of rewards, for a file or columns.

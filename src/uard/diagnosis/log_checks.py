@@ -10,15 +10,14 @@ from uard.diagnosis.case import FEW, LARGEST, PRINTED, ROUNDING, Case, mostly, s
 from uard.diagnosis.finding import Finding, Severity, percent
 from uard.diagnosis.finding import rows as rows_text
 from uard.method import calibration, uncertainty
-from uard.ratings import readers
-from uard.ratings.readers import RatingLog
+from uard.ratings.log import NUMBERS, RatingLog
 
 
 def not_finite(log: RatingLog) -> Finding | None:
     """Numbers that are none."""
     columns = {"reward": log.reward}
     columns |= {name: log.ratings[:, k] for k, name in enumerate(log.raters)}
-    columns |= {name: column for name in readers.NUMBERS if (column := getattr(log, name)) is not None}
+    columns |= {name: column for name in NUMBERS if (column := getattr(log, name)) is not None}
     parts, numbers = [], {}
     for name, column in columns.items():
         bad = ~usable(column)

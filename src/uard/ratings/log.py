@@ -1,0 +1,78 @@
+"""A log of rewards and ratings as one table: a row per step, a column per rater."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from uard import _checks
+
+NUMBERS = ("sigma_m", "true_reward")
+LABELS = ("item", "episode", "step")
+
+
+@dataclass(frozen=True, eq=False)
+class RatingLog:
+    """Rewards and what people said of them, one row per step.
+
+    Attributes:
+        reward: Observed rewards, (n,) with n >= 1; NaN where one is missing.
+        ratings: Ratings in the reward's unit, (n, K); NaN where one is missing. K = 0 if nobody rates.
+        raters: Names of the K annotators; ``rating_1`` and so on if left out.
+        sigma_m: Ensemble disagreement, (n,), >= 0, or None.
+        true_reward: What each step was really worth, (n,), or None.
+        item: What was rated, (n,), or None where every row is another thing.
+        episode: Name of each row's episode, (n,), or None.
+        step: Name of each row's step, (n,), or None.
+        source: Where the log is from.
+    """
+
+    reward: np.ndarray
+    ratings: np.ndarray
+    raters: tuple[str, ...] = ()
+    sigma_m: np.ndarray | None = None
+    true_reward: np.ndarray | None = None
+    item: np.ndarray | None = None
+    episode: np.ndarray | None = None
+    step: np.ndarray | None = None
+    source: str = "log"
+
+    def __post_init__(self) -> None:
+        """Check shapes, and that no sigma_m is negative."""
+        reward = _checks.as_numpy("reward", self.reward)
+        ratings = _checks.as_numpy("ratings", self.ratings)
+        if reward.ndim != 1 or not reward.size:
+            raise _checks.InvalidValueError("reward.shape", reward.shape, "(n,) with at least one row")
+        if ratings.ndim != 2 or len(ratings) != len(reward):
+            raise _checks.InvalidValueError("ratings.shape", ratings.shape, f"({len(reward)}, K), a row per reward")
+        raters = tuple(self.raters) or tuple(f"rating_{k + 1}" for k in range(ratings.shape[1]))
+        if len(raters) != ratings.shape[1]:
+            raise _checks.InvalidValueError("raters", raters, f"{ratings.shape[1]} names, one per column of ratings")
+        checked: dict[str, Any] = {"reward": reward, "ratings": ratings, "raters": raters}
+        for name in (*NUMBERS, *LABELS):
+            column = getattr(self, name)
+            if column is not None:
+                column = _checks.as_numpy(name, column) if name in NUMBERS else np.asarray(column)
+                _checks.same_shape(name, column, "reward", reward)
+                checked[name] = column
+        if "sigma_m" in checked and (checked["sigma_m"] < 0).any():
+            row = int(np.argmax(checked["sigma_m"] < 0))
+            raise bad_cell(self.source, row, "sigma_m", float(checked["sigma_m"][row]), "a number >= 0")
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.reward)
+
+    def place(self, row: int) -> str:
+        """Name a row, counted here from 0: ``row 7 (episode 2, step 3)``."""
+        labels = [f"{n} {getattr(self, n)[row]}" for n in ("episode", "step") if getattr(self, n) is not None]
+        return f"row {row + 1}" + (f" ({', '.join(labels)})" if labels else "")
+
+
+def bad_cell(source: str, row: int, column: str, value: object, allowed: str) -> _checks.InvalidValueError:
+    """Return the error of a cell; ``row`` is counted from 0."""
+    return _checks.InvalidValueError(f"{source}: row {row + 1}, column {column!r}", value, allowed)

@@ -1,0 +1,60 @@
+"""A log from random steps in a Gymnasium environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from uard import _checks
+from uard.ratings.log import LABELS, RatingLog, bad_cell
+
+
+def rollout(env: Any, steps: int = 1000, seed: int = 0) -> RatingLog:
+    """Take random actions in a Gymnasium environment and log what it pays and what is said of it.
+
+    Read from ``info``: ``ratings``, K numbers; ``sigma_m``; and ``evaluation.true_reward`` as the environments of this
+    package give it. Where states and actions are whole numbers a row's item is its state-action.
+
+    Args:
+        env: A ``gymnasium.Env``; it is not closed.
+        steps: Number of steps, >= 1.
+        seed: Seed of the environment and of the actions.
+
+    Raises:
+        InvalidValueError: the number of ratings or what ``info`` holds changes from one step to another.
+    """
+    _checks.whole("steps", steps, low=1)
+    _checks.whole("seed", seed, low=0)
+    env.action_space.seed(seed)
+    columns: dict[str, list[Any]] = {n: [] for n in ("reward", "ratings", "sigma_m", "true_reward", *LABELS)}
+    state, _ = env.reset(seed=seed)
+    episode = step = 0
+    for _ in range(steps):
+        action = env.action_space.sample()
+        next_state, reward, terminated, truncated, info = env.step(action)
+        found = {"ratings": info.get("ratings"), "sigma_m": info.get("sigma_m")}
+        found["true_reward"] = info["evaluation"].true_reward if "evaluation" in info else None
+        whole = isinstance(state, int | np.integer) and isinstance(action, int | np.integer)
+        found["item"] = f"state {state}, action {action}" if whole else None
+        for name, value in (found | {"reward": float(reward), "episode": episode, "step": step}).items():
+            columns[name].append(value)
+        state, step = next_state, step + 1
+        if terminated or truncated:
+            state, _ = env.reset()
+            episode, step = episode + 1, 0
+    for name in ("ratings", "sigma_m", "true_reward", "item"):
+        absent = [v is None for v in columns[name]]
+        if any(absent):
+            if not all(absent):
+                row = absent.index(not absent[0])
+                raise bad_cell("rollout", row, name, columns[name][row], "in info at every step, or at none")
+            del columns[name]
+    widths = [np.shape(v) for v in columns.get("ratings", ())]
+    for row, width in enumerate(widths):
+        if len(width) != 1 or width != widths[0]:
+            raise bad_cell("rollout", row, "ratings", columns["ratings"][row], "a row of K ratings, as in the first")
+    ratings = columns.pop("ratings", np.zeros((steps, 0)))
+    name = "rollout" if env.spec is None else env.spec.id
+    source = f"{name}, {steps} random steps, seed {seed}"
+    return RatingLog(ratings=ratings, source=source, **columns)  # type: ignore[arg-type]
