@@ -26,11 +26,11 @@ def compiled(task: Task, truth: HiddenTruth, actions: jax.Array) -> tuple[jax.Ar
 
     def one(carry: tuple[jax.Array, jax.Array], action: jax.Array) -> tuple[Any, Any]:
         state, time = carry
-        next_observation, reward, terminated, truncated = step(task, state, time, action)
+        next_state, reward, terminated, truncated = step(task, state, time, action)
         done = terminated | truncated
         hidden = truth.reward[state, action], truth.hack[state, action], truth.goal[state, action]
-        carry = jnp.where(done, task.start, next_observation), jnp.where(done, 0, time + 1)
-        return carry, (next_observation, reward, terminated, truncated, *hidden)
+        carry = jnp.where(done, task.start, next_state), jnp.where(done, 0, time + 1)
+        return carry, (next_state, reward, terminated, truncated, *hidden)
 
     return jax.lax.scan(one, (jnp.asarray(task.start, jnp.int32), jnp.int32(0)), actions)[1]
 
