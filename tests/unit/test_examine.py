@@ -20,7 +20,7 @@ from uard.method.mitigations import Raw, named
 from uard.replication import locomotion
 from uard.replication.studies import derive
 from uard.training.feedback.transition_model import TransitionModel
-from uard.training.host import loop as host
+from uard.training.host.loop import Job, run
 from uard.training.host.loops import loop_of
 
 TINY = Network(16, 1e-3, 1.0)
@@ -31,8 +31,8 @@ WHERE = Locomotion(region=None, reference=True)
 
 
 def trained(agent, mitigation):
-    loop = loop_of(host.Job(WHERE, agent, mitigation, 1, 256, rating_model=SMALL, evaluations=1))
-    return loop, host.run(loop).state
+    loop = loop_of(Job(WHERE, agent, mitigation, 1, 256, rating_model=SMALL, evaluations=1))
+    return loop, run(loop).state
 
 
 def test_a_reaction_by_hand():
@@ -80,7 +80,7 @@ def test_what_a_random_action_would_do_leaves_no_trace_in_the_walk(monkeypatch):
 
 
 class RewardFn(SimpleNamespace):
-    """The filtered rewards of places 0 to 99 in a world of reward 1 and discount 0.5, with given values and doubts."""
+    """What is learned at places 0 to 99 in a world of reward 1 and discount 0.5, with given values and doubts."""
 
     job = SimpleNamespace(seed=0, agent=SimpleNamespace(gamma=0.5))
 
@@ -101,8 +101,8 @@ def test_the_warning_knows_wrong_values_and_states_that_were_never_visited():
     values = np.where(wrong, 5.0, 2.0)  # worth 1 / (1 - 0.5) = 2
     at = np.column_stack([places, np.zeros(100)]).astype(float)
     no = np.zeros(100, bool)
-    one = np.ones(100)
-    result = StepResult(np.zeros((100, 2)), one, no, no, true_reward=one, hack=no, success=no, task_reward=one)
+    ones = np.ones(100)
+    result = StepResult(np.zeros((100, 2)), ones, no, no, ones, no, no, ones)
     walked = examine.Walked(at, np.zeros((100, 1)), result)
     for doubts, expected in ((wrong * 1.0, 1.0), (1.0 - wrong, 0.0), (np.ones(100), 0.5)):
         _, error = examine._warning(RewardFn(values=values, doubts=doubts), walked)
