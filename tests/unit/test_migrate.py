@@ -31,7 +31,8 @@ from uard.envs.classic.specs import CartPole
 from uard.envs.grids.gaming import AbsentSupervisor, BoatRace, TomatoWatering
 from uard.envs.grids.learned_reward import LearnedRewardGrid
 from uard.envs.grids.trapgrid import TrapGrid
-from uard.envs.locomotion.physics import Kick, Locomotion, Posture, Spikes
+from uard.envs.locomotion.locomotion import Kick, Locomotion
+from uard.envs.locomotion.regions import Posture
 from uard.lab import studies
 from uard.lab.cell import Cell
 from uard.lab.config import plain
@@ -65,7 +66,7 @@ APPENDIX, COLLUDING, SINGLE = (PANELS[name] for name in ("appendix", "colluding"
 LEARNED = LearnedRewardGrid(size=6, unrated=2, horizon=20)
 HOPPERS = {
     "lies": Locomotion(horizon=100),
-    "spikes": Locomotion("hopper", region=Posture(), spikes=Spikes(), horizon=100),
+    "leans": Locomotion("hopper", region=Posture(), horizon=100),
     "walker": Locomotion("walker2d", 5, legitimate=True, horizon=100),
     "kicked": Locomotion(region=None, kick=Kick(step=20), horizon=100),
 }
@@ -96,7 +97,7 @@ CELLS = (
     Cell(GRID, named("screening"), TRPO(NET, HEADS, **ROLL), **MODEL),
     Cell(GRID, named("uard-paper"), CPO(NET, HEADS, **ROLL), **SHORT),
     Cell(HOPPERS["lies"], named("uard"), PPO(TANH, HEADS, **ON), rated=0.3, steps=512, **TRANSITIONS),
-    Cell(HOPPERS["spikes"], named("raw"), TRPO(TANH, HEADS, **ON), steps=512),
+    Cell(HOPPERS["leans"], named("raw"), TRPO(TANH, HEADS, **ON), steps=512),
     Cell(
         HOPPERS["walker"],
         named("lcb"),
@@ -242,6 +243,15 @@ def test_what_has_no_new_key_is_told_and_stays_in_the_backup(old):
         assert f"only in {found.backup}: 1 rows, for {why}" in said
     assert rows(found.backup, "select count(*) from failures") == [(4,)]
     assert rows(old, "select count(*) from failures") == [(0,)]
+
+
+def test_a_field_that_is_no_more_can_only_be_left_out():
+    old = json.loads(rows(HERE / "format-2.sqlite", "select config from cells where config like '%Locomotion%'")[0][0])
+    assert old["environment"]["spikes"] is None
+    assert "spikes" not in new_config(old)["environment"]
+    old["environment"]["spikes"] = {"class": "uard.envs.mujoco.Spikes", "chance": 0.1, "size": 10.0}
+    with pytest.raises(UnmappedError, match="the spikes of a Locomotion are no more"):
+        new_config(old)
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,11 @@ def aggregate(ratings: Array, proxy: Array, mask: Array | None = None, ddof: int
     if ratings.ndim == 0 or ratings.shape[-1] == 0 or tuple(ratings.shape[:-1]) != tuple(proxy.shape):
         allowed = f"({', '.join([*map(str, proxy.shape), 'K'])}): one row per reward and one column per rater"
         raise _checks.InvalidValueError("ratings.shape", tuple(ratings.shape), allowed)
+    xp = namespace(ratings)
+    if not xp.isdtype(ratings.dtype, "real floating"):  # stars and thumbs
+        ratings = xp.astype(ratings, xp.asarray(0.0).dtype)
+    if mask is not None:
+        _checks.same_shape("mask", mask, "ratings", ratings)
     if mask is None and not _checks.is_traced(ratings):
         here = ratings == ratings
         mask = None if bool(here.all()) else here

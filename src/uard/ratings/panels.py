@@ -1,8 +1,8 @@
 """Panels of raters: what each of K people says of a step.
 
-A simulated rater sees the observed reward (the proxy), the true reward and whether the step is *contested* (one that pays
-for something else than what was meant, such as entering a trap), and answers with a number. In a legitimate twin the
-two rewards agree, but the contested steps stay contested. A panel reads the truth, as people do; the learner gets
+A simulated rater sees the observed reward (the proxy), the true reward and whether the step is *contested* (one that
+pays for something else than what was meant, such as entering a trap), and answers with a number. In a legitimate twin
+the two rewards agree, but the contested steps stay contested. A panel reads the truth, as people do; the learner gets
 nothing but the ratings.
 
 What a panel says of a step is a law, and an answer is drawn from it:
@@ -167,7 +167,8 @@ class Panel:
         low, high = self.low or 0.0, self.high or 0.0
         width = [0.0 if r.stars is None else (high - low) / (r.stars - 1) for r in self.raters]
         columns = [r.lapse for r in self.raters], [r.coverage for r in self.raters], width
-        return Quirks(*(np.array(c, np.float32) for c in columns), np.float32(low), np.float32(high))
+        lapse, coverage, step = (np.array(c, np.float32) for c in columns)
+        return Quirks(lapse, coverage, step, np.float32(low), np.float32(high))
 
 
 def _noise(rater: Rater, proxy: Array, contested: Array, xp: Any) -> Array:
@@ -197,11 +198,12 @@ def answers(law: RatingLaw, normal: Array, uniform: Array | None = None) -> tupl
 
 
 def draw(law: RatingLaw, random: np.random.Generator) -> np.ndarray:
-    """Return one rating of every rater (..., K) as NumPy numbers, NaN where a rater did not answer."""
+    """Return one rating of every rater (..., K) as NumPy numbers, NaN where a rater did not or cannot answer."""
     normal = random.standard_normal(law.centre.shape)
     uniform = None if law.quirks is None else random.random((*law.centre.shape, UNIFORMS))
     ratings, mask = answers(law, normal, uniform)
-    return ratings if mask is None else np.where(mask, ratings, np.nan)
+    ratings = ratings if mask is None else np.where(mask, ratings, np.nan)
+    return ratings if law.reach is None else np.where(np.asarray(law.reach)[..., None] > 0, ratings, np.nan)
 
 
 # The paper gives no numbers for the first but sigma_h = 1.247, the deviation of {-1, 2, 1}. So on a contested step its
@@ -215,7 +217,7 @@ SINGLE = Panel((Rater(),))
 PANELS: dict[str, Panel] = {"main": MAIN, "appendix": APPENDIX, "colluding": COLLUDING, "single": SINGLE}
 DESCRIPTIONS: dict[str, str] = {
     "main": "One truthful, one tempted, one erratic on contested steps (section 5.8 of the paper).",
-    "appendix": "Three truthful ones with noise of sd 0.1, 0.3 and 0.2, the last 1.0 on contested steps (its appendix).",
+    "appendix": "Three truthful ones with noise of sd 0.1, 0.3 and 0.2, the last 1.0 where contested (its appendix).",
     "colluding": "Three who all repeat the proxy: no method that listens to them can help, a control that must fail.",
     "single": "One truthful rater with sd 0.1, who alone never disagrees with itself.",
 }

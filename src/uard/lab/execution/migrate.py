@@ -56,7 +56,6 @@ _NAMES = {
         "envs.mujoco.Locomotion",
         "envs.mujoco.Vibration",
         "envs.mujoco.Posture",
-        "envs.mujoco.Spikes",
         "envs.mujoco.Kick",
         "mitigation.Raw",
         "mitigation.RatedReward",
@@ -68,6 +67,7 @@ _NAMES = {
     )},
 }  # fmt: skip
 _FIELDS = {("Cell", "feedback"): "rating_model"}
+_GONE = {("Locomotion", "spikes")}  # fields that can only be left out
 _LEFT_OUT: dict[str, dict[str, Any]] = {
     "Cell": {"rating_model": None, "steps": None, "query": "random"},
     "Network": {"activation": "relu"},
@@ -193,8 +193,11 @@ def _new_value(old: Any) -> Any:
     if not isinstance(old, dict):
         return old
     name = _new_name(old["class"])
-    fields = {_FIELDS.get((name, k), k): _new_value(value) for k, value in old.items() if k != "class"}
-    return {TYPE: name, **_LEFT_OUT.get(name, {}), **fields}
+    for gone in (k for k, value in old.items() if (name, k) in _GONE and value is not None):
+        raise UnmappedError(f"the {gone} of a {name} are no more")
+    fields = {k: value for k, value in old.items() if k != "class" and (name, k) not in _GONE}
+    new = {_FIELDS.get((name, k), k): _new_value(value) for k, value in fields.items()}
+    return {TYPE: name, **_LEFT_OUT.get(name, {}), **new}
 
 
 def _new_name(path: str) -> str:
