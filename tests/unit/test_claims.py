@@ -122,7 +122,7 @@ def test_claims_of_the_dead_are_taken_over(store, owner, stranger):
     assert len(store.claimed()) == 1
     store.put([(ONE, 0, result(1))])
     store.put([(ONE, 0, result(2))])
-    assert store.get(ONE, [0])[0].steps == 1, "a late result of the dead changes nothing"
+    assert store.get(ONE, [0])[0].steps == 1, "a late result of a process that counted as dead changes nothing"
 
 
 def test_a_heartbeat_revives_one_that_counted_as_dead(store, path, owner):

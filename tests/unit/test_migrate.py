@@ -36,10 +36,10 @@ from uard.envs.locomotion.regions import Posture
 from uard.lab import studies
 from uard.lab.cell import Cell
 from uard.lab.config import plain
-from uard.lab.execution import migrate as migration
-from uard.lab.execution import runner
+from uard.lab.execution import format_2, runner
 from uard.lab.execution.claims import Owner
-from uard.lab.execution.migrate import UnmappedError, lines, migrate, new_config, new_key
+from uard.lab.execution.format_2 import UnmappedError, new_config, new_key
+from uard.lab.execution.migrate import lines, migrate
 from uard.lab.execution.store import Store, StoreError
 from uard.lab.execution.trainers import TRAINERS
 from uard.lab.result import METRICS
@@ -209,7 +209,7 @@ def test_what_else_an_old_store_knows_goes_along(old):
 
 
 def test_metrics_get_their_new_names_and_stay_sound(old, monkeypatch):
-    monkeypatch.setattr(migration, "METRICS", {"trap_visits": "visits"})
+    monkeypatch.setattr(format_2, "METRICS", {"trap_visits": "visits"})
     (text,) = rows(old, "select metrics from results where seed = 7 limit 1")[0]
     migrate(old)
     with closing(Store(old)) as store:

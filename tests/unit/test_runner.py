@@ -291,7 +291,7 @@ def test_an_interrupt_loses_nothing_that_was_finished(tmp_path):
 def test_every_core_is_used_if_nothing_is_said(monkeypatch):
     asked = []
 
-    def several(queue, workers, *_):
+    def several(workers, queue, *_):
         asked.append((len(queue), workers))
         yield from ()
 

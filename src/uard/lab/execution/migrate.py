@@ -1,15 +1,10 @@
 """Brings what older versions have written over to the present format of configurations and keys: ``uard migrate``.
 
-Up to format 2 a class stood in a configuration with its address, a panel with its name, and fields at their defaults
-were left out if they were younger than the format. The tables below say what became of each. They are of the day on
-which format 3 began, and stay as they are: what is done to a class later is no part of them.
-
-Whatever is migrated, the old file is kept beside the new one.
+The old file is kept beside the new one.
 """
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import shutil
@@ -23,93 +18,12 @@ from typing import Any
 
 from uard import _checks
 from uard._support import files
-from uard.agents.base import Agent
-from uard.lab.config import FORMAT, TYPE, key_of
+from uard.lab.config import FORMAT
+from uard.lab.execution import format_2
 from uard.lab.execution.claims import Owner
-from uard.lab.execution.store import OLDEST, TABLES, StoreError, check_store, create_tables
+from uard.lab.execution.format_2 import UnmappedError
+from uard.lab.execution.store import TABLES, StoreError, check_store, create_tables
 from uard.lab.result import digest
-
-# New names of metrics and of the log's columns, by their old ones.
-METRICS: dict[str, str] = {}
-COLUMNS: dict[str, str] = {}
-
-_NAMES = {
-    **{f"uard.{name}": name.rpartition(".")[2] for name in (
-        "lab.cell.Cell",
-        "abstention.Abstention",
-        "agents.tabular.QLearning",
-        "agents.value.DeepQ",
-        "agents.actor_critic.SoftActorCritic",
-        "agents.policy.PPO",
-        "agents.policy.TRPO",
-        "agents.policy.CPO",
-        "agents.continuous.ContinuousActorCritic",
-        "networks.Network",
-        "networks.Ensemble",
-        "envs.trapgrid.TrapGrid",
-        "envs.learned_reward.LearnedRewardGrid",
-        "envs.gaming.BoatRace",
-        "envs.gaming.TomatoWatering",
-        "envs.gaming.AbsentSupervisor",
-        "envs.classic.CartPole",
-        "envs.classic.Acrobot",
-        "envs.mujoco.Locomotion",
-        "envs.mujoco.Vibration",
-        "envs.mujoco.Posture",
-        "envs.mujoco.Kick",
-        "mitigation.Raw",
-        "mitigation.RatedReward",
-        "mitigation.Screening",
-        "mitigation.RewardDiscounting",
-        "reliability.ReliabilityFilter",
-        "feedback.learned.RatingModel",
-        "feedback.transitions.TransitionModel",
-    )},
-}  # fmt: skip
-_FIELDS = {("Cell", "feedback"): "rating_model"}
-_GONE = {("Locomotion", "spikes")}  # fields that can only be left out
-_LEFT_OUT: dict[str, dict[str, Any]] = {
-    "Cell": {"rating_model": None, "steps": None, "query": "random"},
-    "Network": {"activation": "relu"},
-}
-_FAMILIES = {
-    "QLearning": "tabular",
-    "DeepQ": "replay",
-    "SoftActorCritic": "replay",
-    "PPO": "rollout",
-    "TRPO": "rollout",
-    "CPO": "rollout",
-    "ContinuousActorCritic": "continuous-replay",
-}
-_TRAINERS = {
-    ("tabular", False): "tabular",
-    ("replay", False): "compiled-replay",
-    ("rollout", False): "compiled-rollout",
-    ("rollout", True): "simulated-rollout",
-    ("continuous-replay", True): "simulated-replay",
-}  # by family, and by whether it was trained for steps on a simulator
-_VERSION = 1  # of all kinds of training
-
-
-def _rater(**changes: Any) -> dict[str, Any]:
-    usual = {"temptation": 0.0, "bias": 0.0, "scale": 1.0, "noise": 0.1, "contested_noise": None, "lapse": 0.0}
-    return {TYPE: "Rater", **usual, "coverage": 1.0, "stars": None, **changes}
-
-
-def _panel(*raters: dict[str, Any]) -> dict[str, Any]:
-    return {TYPE: "Panel", "raters": list(raters), "low": None, "high": None}
-
-
-_PANELS = {
-    "main": _panel(_rater(), _rater(temptation=0.6, contested_noise=0.0), _rater(temptation=0.4, contested_noise=1.0)),
-    "appendix": _panel(_rater(), _rater(noise=0.3), _rater(noise=0.2, contested_noise=1.0)),
-    "colluding": _panel(*[_rater(temptation=1.0, noise=0.0)] * 3),
-    "single": _panel(_rater()),
-}
-
-
-class UnmappedError(ValueError):
-    """A configuration for which there is no new one; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -154,73 +68,8 @@ def migrate(path: str | Path) -> Migration:
     path = Path(path)
     if not path.is_file():
         raise _checks.InvalidValueError("path", str(path), "a result store, or a JSON file of published results")
-    backup = path.with_name(f"{path.name}.format-{OLDEST}")
+    backup = path.with_name(f"{path.name}.format-{format_2.NUMBER}")
     return _migrate_published(path, backup) if path.suffix == ".json" else _migrate_store(path, backup)
-
-
-def new_config(old: dict[str, Any]) -> dict[str, Any]:
-    """Return the present form of a configuration of format 2.
-
-    Raises:
-        UnmappedError: it has none.
-    """
-    config = _new_value(old)
-    if config[TYPE] != "Cell" or old.get("panel") not in _PANELS:
-        raise UnmappedError(f"no cell of format {OLDEST} looked like that: {_checks.short(old)}")
-    return config | {"panel": _PANELS[old["panel"]]}
-
-
-def new_key(config: dict[str, Any], old: dict[str, Any]) -> str:
-    """Return the key of a configuration.
-
-    Args:
-        config: What ``new_config`` returned.
-        old: What it was made of.
-
-    Raises:
-        UnmappedError: nobody knows how it was trained.
-    """
-    family = _FAMILIES.get(config["agent"][TYPE]) or _family_of(old["agent"]["class"])
-    trainer = _TRAINERS.get((family, config["steps"] is not None))
-    if trainer is None:
-        raise UnmappedError(f"an agent of the family {family} was not trained in {config['environment'][TYPE]}")
-    return key_of(config, trainer, _VERSION)
-
-
-def _new_value(old: Any) -> Any:
-    if isinstance(old, list):
-        return [_new_value(value) for value in old]
-    if not isinstance(old, dict):
-        return old
-    name = _new_name(old["class"])
-    for gone in (k for k, value in old.items() if (name, k) in _GONE and value is not None):
-        raise UnmappedError(f"the {gone} of a {name} are no more")
-    fields = {k: value for k, value in old.items() if k != "class" and (name, k) not in _GONE}
-    new = {_FIELDS.get((name, k), k): _new_value(value) for k, value in fields.items()}
-    return {TYPE: name, **_LEFT_OUT.get(name, {}), **new}
-
-
-def _new_name(path: str) -> str:
-    package, _, _ = path.partition(".")
-    if package == "uard" and path not in _NAMES:
-        raise UnmappedError(f"uard had no class {path} that a result was of")
-    if "<locals>" in path:
-        raise UnmappedError(f"the class {path} is local to a function")
-    return _NAMES[path] if package == "uard" else f"{package}/{path.rpartition('.')[2]}"
-
-
-def _family_of(path: str) -> str:
-    """Return the family of another package's agent."""
-    module, _, name = path.rpartition(".")
-    try:
-        found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise UnmappedError(
-            f"its agent {path} cannot be imported, so that nobody knows how it learned ({error})"
-        ) from None
-    if not (isinstance(found, type) and issubclass(found, Agent)):
-        raise UnmappedError(f"its agent {path} is no uard.agents.base.Agent")
-    return found.family
 
 
 class _Keys:
@@ -231,8 +80,8 @@ class _Keys:
         self.why: dict[str, str] = {}
         for key, old in configs.items():
             try:
-                config = new_config(old)
-                self.new[key] = new_key(config, old), config
+                config = format_2.new_config(old)
+                self.new[key] = format_2.new_key(config, old), config
             except UnmappedError as error:
                 self.why[key] = str(error)
 
@@ -246,8 +95,8 @@ def _migrate_published(path: Path, backup: Path) -> Migration:
         data = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise _checks.InvalidValueError("path", str(path), f"JSON ({error})") from None
-    if not isinstance(data, dict) or "cells" not in data or data.get("results") != OLDEST:
-        allowed = f"published results of format {OLDEST} (what `uard reproduce --extract` wrote)"
+    if not isinstance(data, dict) or "cells" not in data or data.get("results") != format_2.NUMBER:
+        allowed = f"published results of format {format_2.NUMBER} (what `uard reproduce --extract` wrote)"
         raise _checks.InvalidValueError("path", str(path), allowed)
     keys, rows, left, cells = _Keys({k: c["config"] for k, c in data["cells"].items()}), Counter[str](), Counter(), {}
     for key, cell in data["cells"].items():
@@ -255,9 +104,9 @@ def _migrate_published(path: Path, backup: Path) -> Migration:
             left[keys.reason(key)] += len(cell["seeds"])
             continue
         new, config = keys.new[key]
-        cells[new] = {**cell, "config": config, "metrics": _renamed(cell["metrics"], METRICS)}
+        cells[new] = {**cell, "config": config, "metrics": _renamed(cell["metrics"], format_2.METRICS)}
         if "curves" in cell:
-            cells[new]["curves"] = _renamed(cell["curves"], COLUMNS)
+            cells[new]["curves"] = _renamed(cell["curves"], format_2.COLUMNS)
         rows["results"] += len(cell["seeds"])
     _check_free(path, backup)
     head = {"format" if k == "results" else k: FORMAT if k == "results" else v for k, v in data.items()}
@@ -305,7 +154,7 @@ def _alone(path: Path) -> Iterator[sqlite3.Connection]:
     with closing(sqlite3.connect(path, timeout=5)) as db:
         if db.execute("pragma user_version").fetchone()[0] == FORMAT:
             raise StoreError(f"store = {str(path)!r}: is of format {FORMAT} already; there is nothing to migrate")
-        tables = check_store(db, str(path), OLDEST)
+        tables = check_store(db, str(path), format_2.NUMBER)
         if "runs" in tables:
             living = "select token, host, place, pid, born, beat from runs where ended is null"
             for *owner, beat in db.execute(living):
@@ -362,7 +211,7 @@ def _checked(table: str, row: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     if digest(row["data"] + row["metrics"].encode()) != row["checksum"]:
         kept = {k: row[k] for k in ("key", "seed", "data", "created")}
         return "quarantine", kept | {"reason": "checksum does not match"}
-    if METRICS:
-        metrics = json.dumps(_renamed(json.loads(row["metrics"]), METRICS))
+    if format_2.METRICS:
+        metrics = json.dumps(_renamed(json.loads(row["metrics"]), format_2.METRICS))
         row |= {"metrics": metrics, "checksum": digest(row["data"] + metrics.encode())}
     return table, row

@@ -114,12 +114,8 @@ def _cores() -> int:
 def _train(queue: list[list[Job]], workers: int, folder: Path | None, claim: Claim, engine: Engine | None) -> Outcomes:
     if engine is None:
         alone = workers <= 1 or len(queue) == 1
-        engine = in_this_process if alone else partial(_in_processes, workers)
+        engine = in_this_process if alone else partial(in_processes, workers)
     return engine(queue, folder, claim)
-
-
-def _in_processes(workers: int, queue: list[list[Job]], folder: Path | None, claim: Claim) -> Outcomes:
-    return in_processes(queue, workers, folder, claim)
 
 
 class _Work:

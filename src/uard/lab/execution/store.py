@@ -47,7 +47,7 @@ TABLES = {
 }
 # Whoever asks what is finished need not walk past the bytes.
 _INDEX = "create index if not exists results_finished on results (key, seed, created);"
-OLDEST = 2  # format that can be migrated
+UNNUMBERED = 2  # format of stores whose file bears no number
 _COLUMNS = {"key", "seed", "data", "checksum", "metrics", "version", "created"}  # of results
 
 
@@ -409,7 +409,7 @@ def check_store(db: sqlite3.Connection, path: str, version: int = FORMAT) -> set
     tables = {row[0] for row in db.execute("select name from sqlite_master where type = 'table'")}
     if tables and {row[1] for row in db.execute("pragma table_info(results)")} != _COLUMNS:
         raise sqlite3.DatabaseError("its tables are another program's")
-    found = db.execute("pragma user_version").fetchone()[0] or OLDEST  # which bore no number
+    found = db.execute("pragma user_version").fetchone()[0] or UNNUMBERED
     if tables and found != version:
         todo = f"`uard migrate {path}` brings it over; nothing is lost" if found < version else "a newer uard is needed"
         raise StoreError(f"store = {path!r}: must be of format {version}, but it is of format {found}: {todo}")

@@ -30,12 +30,12 @@ def in_this_process(queue: Iterable[list[Job]], folder: Path | None, claim: Clai
             yield mine, attempt(mine, folder)
 
 
-def in_processes(queue: list[list[Job]], workers: int, folder: Path | None, claim: Claim) -> Outcomes:
+def in_processes(workers: int, queue: list[list[Job]], folder: Path | None, claim: Claim) -> Outcomes:
     """Train batches in several processes, each on a core of its own; what cannot be pickled is trained here at last.
 
     Args:
-        queue: Batches, the longest first.
         workers: Most processes.
+        queue: Batches, the longest first.
         folder: Of checkpoints.
         claim: Asked before a batch is handed out.
     """

@@ -7,7 +7,6 @@ from dataclasses import fields, replace
 from typing import Any
 
 from uard import _checks
-from uard.envs.grids.trapgrid import paper_grid
 from uard.lab import registry as names
 from uard.lab.cell import Cell
 from uard.lab.studies.common import LOCOMOTION_STEPS, PANELS
@@ -49,12 +48,11 @@ def agents() -> tuple[Row, ...]:
     """Every agent of a package, on 6x6 and its twin, or on Hopper if its actions are continuous."""
     rows: list[Row] = []
     for plugin, agent in names.brought("agent")[0].items():
-        name, grid = "TrapGrid6", paper_grid(6)
-        if not names.can_work(agent, grid):
-            name = "Hopper-Vibration"
-            grid = names.ENVIRONMENTS[name]
-        rows += _crossed(name, grid, plugin.name, agent, (*PANELS, "colluding"))
-        rows += _crossed(f"{name}, legitimate", replace(grid, legitimate=True), plugin.name, agent, PANELS)
+        grid = names.can_work(agent, names.ENVIRONMENTS["TrapGrid6"])
+        name = "TrapGrid6" if grid else "Hopper-Vibration"
+        rows += _crossed(name, names.ENVIRONMENTS[name], plugin.name, agent, (*PANELS, "colluding"))
+        twin = names.ENVIRONMENTS[f"{name}-Legitimate"]
+        rows += _crossed(f"{name}, legitimate", twin, plugin.name, agent, PANELS)
     return tuple(rows)
 
 

@@ -138,7 +138,7 @@ def clock(when: float) -> str:
 
 
 def lines(runs: Iterable[WorkerRun], now: float | None = None) -> list[str]:
-    """Return one line for every process: alive or dead, how far, how fast, how long still."""
+    """Return one line for every process: whether it is alive, how far it is, how fast, and how long it still needs."""
     now, found = time.time() if now is None else now, []
     for run in runs:
         stop = run.ended or run.beat
@@ -153,7 +153,7 @@ def lines(runs: Iterable[WorkerRun], now: float | None = None) -> list[str]:
         if run.alive and run.remaining is not None:
             parts.append(f"about {duration(max(0.0, run.remaining - (now - run.beat)))} left")
         if not run.alive:
-            parts.append(f"last sign of life {clock(stop)}")
+            parts.append(f"last heartbeat {clock(stop)}")
         found.append("; ".join(parts))
     return found
 
