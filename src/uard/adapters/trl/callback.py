@@ -1,4 +1,4 @@
-"""The callback of the TRL adapter; apart, because it alone needs transformers before anything is trained."""
+"""The callback of the TRL adapter; a file of its own, because it alone needs transformers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ except ModuleNotFoundError as error:
     ) from error
 
 from uard import _checks
-from uard.adapters.trl.reward import UncertaintyDiscountedReward, keeps_factor
+from uard.adapters.trl.advantages import keeps_factor
+from uard.adapters.trl.reward import UncertaintyDiscountedReward
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +31,7 @@ class DiscountCancelledWarning(UserWarning):
 
 
 class UselessJudgeWarning(UserWarning):
-    """A judge cannot be compared with the others, or says what they say."""
+    """A judge cannot be compared with the others, or always agrees with them."""
 
 
 class ForgottenWarning(UserWarning):
@@ -44,6 +45,13 @@ class ReliabilityCallback(TrainerCallback):
     the same advantages without it, under this trainer's configuration), of a judge that never varies or never scores,
     of judges that never disagree, and of a reward that the trainer does not call. What the reward knows is kept in
     every checkpoint and read again when training is resumed.
+
+    >>> reward = UncertaintyDiscountedReward({"length": lambda completions, **q: [len(x) for x in completions],
+    ...                                       "ums": lambda completions, **q: [-x.count("um") for x in completions]})
+    >>> callback = ReliabilityCallback(reward)  # GRPOTrainer(..., reward_funcs=reward, callbacks=[callback])
+    >>> learned = reward(["why?"] * 2, ["so", "um, so"])
+    >>> print(callback.report().splitlines()[0])
+    2 completions, 0 without any score, 0 that could not be checked; mean weight ...
 
     Attributes:
         reward: What is watched.
@@ -60,10 +68,10 @@ class ReliabilityCallback(TrainerCallback):
         Raises:
             InvalidValueError: for another kind of reward.
         """
-        if not isinstance(reward, UncertaintyDiscountedReward):
-            raise _checks.InvalidValueError("reward", reward, "an UncertaintyDiscountedReward")
+        allowed = "an UncertaintyDiscountedReward"
+        self.reward = _checks.instance("reward", reward, UncertaintyDiscountedReward, allowed)
         _checks.whole("patience", patience, low=1)
-        self.reward, self.patience = reward, patience
+        self.patience = patience
         self._warned: set[str] = set()
 
     def on_train_begin(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
@@ -78,7 +86,7 @@ class ReliabilityCallback(TrainerCallback):
         else:
             warnings.warn(
                 f"training is resumed at step {state.global_step}, but {file} does not exist: the judges' scales and "
-                "what disagreement is usual are learned anew",
+                "their mean disagreement are measured anew",
                 ForgottenWarning,
                 stacklevel=2,
             )
