@@ -23,6 +23,7 @@ import numpy as np
 from rich.console import Console
 
 from uard.agents.tabular import QLearning
+from uard.cli.terminal import show
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
 from uard.lab.execution import runner
@@ -89,7 +90,7 @@ def listing(cells: int, folder: Path) -> dict[str, Any]:
         assert clocked("resume: what is missing", lambda: runner.run(jobs, store)) == 0
         table = clocked("report: the study's table", lambda: study_table(cold, Evidence(store, [0], [cold])))
         with open(folder / "table.txt", "w") as file:
-            clocked("report: print it", lambda: table.to_rich(Console(file=file)))
+            clocked("report: print it", lambda: show(table, Console(file=file)))
     every = [round(sum(s[i] for s in seconds.values()), 2) for i in (0, 1)]
     return {"cells": cells, "megabytes": round(path.stat().st_size / 1e6), "seconds": seconds, "all": every}
 

@@ -1,13 +1,24 @@
-"""Environments, agents and mitigations of other packages, found by their entry points.
+"""The door for other packages: what their entry points bring is known as soon as they are installed.
 
-A package names them in its ``pyproject.toml``, and they are known as soon as it is installed:
+A package names what it brings in its ``pyproject.toml``:
 
     [project.entry-points."uard.mitigations"]
     ceiling = "my_package:Ceiling"
 
-What an entry point names is called, without arguments or with a mitigation's parameters, and must return a frozen
-dataclass of its kind. It is imported when somebody asks for it by name, never by ``import uard``.
-"""
+| group | an entry point names | which |
+|---|---|---|
+| ``uard.environments``, ``uard.agents``, ``uard.mitigations`` | a class or a function | called without arguments (or with a mitigation's parameters) returns a frozen dataclass of that kind |
+| ``uard.studies`` | a function | returns ``{name of a group: (uard.lab.study.Study, ...)}``; groups of one name are joined |
+| ``uard.results`` | a function | returns a ``uard.lab.views.published.ResultFiles``: published results that a report may show |
+| ``uard.reports`` | a function of ``uard.lab.views.evidence.Evidence`` | returns ``uard.lab.views.sections.Section`` s of the report |
+| ``uard.commands`` | a frozen dataclass | is a command of ``uard``: its fields are the options, its docstring the help, ``run(console)`` what it does |
+
+Environments, agents, mitigations and commands are known by the entry point's name, which nobody else may have; the
+other names are of no account. Everything is imported when somebody asks for it, never by ``import uard``. What cannot
+be used is a ``PluginError`` that names it and its package; ``uard list`` and ``uard reproduce`` print it and go on.
+
+The replication of the paper (``uard.replication``) comes in by this door too.
+"""  # noqa: E501 (a table)
 
 from __future__ import annotations
 
@@ -16,11 +27,19 @@ from collections.abc import Callable, Container
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
-from typing import Any
+from typing import Any, TypeVar
 
 from uard import _checks
 
-KINDS = {"environment": "uard.environments", "agent": "uard.agents", "mitigation": "uard.mitigations"}
+T = TypeVar("T")
+
+NAMED = {
+    "environment": "uard.environments",
+    "agent": "uard.agents",
+    "mitigation": "uard.mitigations",
+    "command": "uard.commands",
+}
+KINDS = NAMED | {"studies": "uard.studies", "results": "uard.results", "report": "uard.reports"}
 
 
 class PluginError(_checks.InvalidValueError):
@@ -53,8 +72,25 @@ class Plugin:
         """Where it comes from, in words."""
         return f"entry point {self.name} = {self.entry.value} of package {self.package}"
 
+    def get(self) -> Any:
+        """Import what the entry point names and return it.
+
+        Raises:
+            PluginError: it cannot be imported.
+        """
+        return self._tried(self.entry.load)
+
+    def call(self, *arguments: Any) -> Any:
+        """Import what the entry point names, call it, and return what it returns.
+
+        Raises:
+            PluginError: it cannot be imported, or raises.
+        """
+        function = self.get()
+        return self._tried(lambda: function(*arguments))
+
     def load(self, is_one: Callable[[Any], bool]) -> Callable[..., Any]:
-        """Import it and return what builds it.
+        """Return what builds an environment, an agent or a mitigation.
 
         Args:
             is_one: Whether an object is of this plugin's kind.
@@ -62,15 +98,17 @@ class Plugin:
         Raises:
             PluginError: it cannot be imported or called, or what it returns is of another kind.
         """
-        try:
-            build = self.entry.load()
-            made = build()
-        except Exception as error:
-            raise PluginError(self, f"{type(error).__name__}: {error}") from error
+        made = self.call()
         if not (is_one(made) and _checks.is_frozen(made)):
             article = "an" if self.kind[0] in "ae" else "a"
             raise PluginError(self, f"{_checks.short(made)} is no frozen dataclass that is {article} {self.kind}")
-        return build
+        return self.get()
+
+    def _tried(self, action: Callable[[], Any]) -> Any:
+        try:
+            return action()
+        except (Exception, SystemExit) as error:  # a package must not end this process either
+            raise PluginError(self, f"{type(error).__name__}: {error}") from error
 
 
 @cache
@@ -81,21 +119,33 @@ def found(kind: str) -> tuple[Plugin, ...]:
     return tuple(sorted(every, key=lambda p: (p.name, p.package, p.entry.value)))
 
 
-def usable(kind: str, own: Container[str]) -> dict[str, Plugin]:
-    """Return a kind's plugins by name, without those whose name is taken: in ``own`` (uard's), or by each other."""
-    return {p.name: p for p in found(kind) if _taken(p, own) is None}
+def brought(
+    kind: str, read: Callable[[Plugin], T], own: Container[str] = ()
+) -> tuple[dict[Plugin, T], list[PluginError]]:
+    """Return what packages bring of a kind, and what of it is broken.
 
-
-def clashes(kind: str, own: Container[str]) -> list[PluginError]:
-    """Return an error for every plugin whose name is taken."""
-    return [PluginError(p, why) for p in found(kind) if (why := _taken(p, own)) is not None]
+    Args:
+        kind: One of ``KINDS``.
+        read: Gets what a plugin brings, checked; raises ``PluginError``.
+        own: All names of the kind that are uard's.
+    """
+    good: dict[Plugin, T] = {}
+    bad: list[PluginError] = []
+    for plugin in found(kind):
+        try:
+            if (why := _taken(plugin, own)) is not None:
+                raise PluginError(plugin, why)
+            good[plugin] = read(plugin)
+        except PluginError as error:
+            bad.append(error)
+    return good, bad
 
 
 def pick(kind: str, name: str, own: Container[str], names: list[str]) -> Plugin:
     """Return the plugin of that name.
 
     Args:
-        kind: One of ``KINDS``.
+        kind: One of ``NAMED``.
         name: What is asked for.
         own: All names of the kind that are uard's.
         names: Those of them that would do, for the message.
@@ -104,14 +154,20 @@ def pick(kind: str, name: str, own: Container[str], names: list[str]) -> Plugin:
         PluginError: several packages bring it.
         UnknownNameError: there is none; with the nearest name.
     """
-    for clash in clashes(kind, own):
-        if clash.plugin.name == name and name not in own:
-            raise clash
-    brought = usable(kind, own)
-    return brought[_checks.choose(kind, name, [*names, *brought])]
+    usable = {}
+    for plugin in found(kind):
+        why = _taken(plugin, own)
+        if why is None:
+            usable[plugin.name] = plugin
+        elif plugin.name == name and name not in own:
+            raise PluginError(plugin, why)
+    return usable[_checks.choose(kind, name, [*names, *usable])]
 
 
 def _taken(plugin: Plugin, own: Container[str]) -> str | None:
+    """Say who has a plugin's name if somebody has: uard, or another package."""
+    if plugin.kind not in NAMED:
+        return None
     if plugin.name in own:
         return f"the name is uard's own {plugin.kind}"
     if Counter(p.name for p in found(plugin.kind))[plugin.name] > 1:

@@ -2,6 +2,7 @@ import json
 import os
 import signal
 import sqlite3
+import stat
 import subprocess
 import sys
 import time
@@ -11,9 +12,11 @@ from unittest.mock import ANY
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from uard import __version__
-from uard.cli.app import main as cli
+from uard.cli import app as cli
+from uard.cli import terminal
 from uard.lab import registry as names
 from uard.lab import studies
 from uard.lab.execution import runner
@@ -48,7 +51,7 @@ def test_version():
 @pytest.mark.parametrize(
     ("command", "says"),
     [
-        ((), ("run", "reproduce", "ledger", "list")),
+        ((), ("run", "reproduce", "ledger", "list", "doctor", "best-of-n", "leaderboard", "status", "compare")),
         (("run",), ("--set", "--set-mitigation", "--noise-fraction", "--json", "Who rates")),
         (("reproduce",), ("--report", "--store", "--workers", "--seeds")),
         (("ledger",), ("--json", "J5 F3")),
@@ -115,7 +118,7 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
         ),
         ("run BoatRace --noise-fraction 0.3", "noise_fraction = 0.3: must be left out where no trap pays"),
         ("run --agent dqn --feedback tabel", "feedback = 'tabel': must be one of *did you mean 'table'?"),
-        ("run --feedback model", "feedback = RatingModel(*none for a tabular agent"),
+        ("run --feedback model", "rating_model = RatingModel(*none for a tabular agent"),
         ("run --agent dqn --set-agent batch=0", "batch = 0: must be a whole number in [1, 4096]"),
         ("reproduce grid-dep", "study = 'grid-dep': must be one of *did you mean 'grid-deep'?"),
         ("run --panel mian", "panel = 'mian': must be one of *did you mean 'main'?"),
@@ -264,6 +267,38 @@ def test_compare_says_whether_two_stores_agree(tmp_path, monkeypatch, capsys):
     assert "verdict: differ" in out
     found = json.loads((tmp_path / "c.json").read_text())
     assert (found["differs"], found["identical"], found["cells"][0]["key"]) == (True, False, cell.key)
+
+
+def test_json_goes_where_it_is_told_and_replaces_no_device(tmp_path):
+    """The real program, for it is standard output that matters."""
+    (tmp_path / "log.csv").write_text("reward,rating_a,rating_b\n" + "".join(f"{i},{i},{i + 0.1}\n" for i in range(50)))
+    (tmp_path / "real.json").write_text("old")
+    (tmp_path / "link.json").symlink_to("real.json")
+
+    def doctor(target):
+        done = uard("doctor", "log.csv", "--json", target, cwd=tmp_path)
+        assert (done.returncode, done.stderr) == (0, "")
+        return done.stdout
+
+    plain, expected = doctor("/dev/null"), json.loads(doctor("-"))
+    assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+    there = doctor("/dev/stdout")
+    assert there.endswith(plain)
+    assert json.loads(there.removesuffix(plain)) == expected
+    doctor("link.json")
+    assert (tmp_path / "link.json").is_symlink()
+    assert json.loads((tmp_path / "real.json").read_text()) == expected
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link.json", "log.csv", "real.json"]
+
+
+def test_what_others_wrote_is_printed_as_it_is(capsys):
+    terminal.table(["[b]a[/b]", "b"], [["x[/red]", "\x1b[31mred"], ["\r\x07", "y"]], "a [title]", marked=(1,))
+    terminal.glossary("t[/]", {"[name]": "\x9b0m [/text]"})
+    terminal.warning(Console(highlight=False), "[bold]no[/bold]\x1b]0;title\x07")
+    out = capsys.readouterr().out
+    for text in ("[b]a[/b]", "x[/red]", r"\x1b[31mred", r"\r\x07", "a [title]", "t[/]", "[name]", r"\x9b0m [/text]"):
+        assert text in out
+    assert r"warning: [bold]no[/bold]\x1b]0;title\x07" in out
 
 
 def test_an_interrupt_is_no_accident(tmp_path):

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from uard import __version__
-from uard.cli.app import main as cli
+from uard.cli import app as cli
 
 UARD = str(Path(sys.executable).parent / "uard")
 HONEST = "reward,rating_ann,rating_bob\n" + "".join(f"{i / 50},{i / 50 + 0.001},{i / 50 - 0.001}\n" for i in range(50))

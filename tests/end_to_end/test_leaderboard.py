@@ -9,7 +9,7 @@ import pytest
 
 from uard import InvalidValueError
 from uard.agents.tabular import QLearning
-from uard.cli.app import main as cli
+from uard.cli import app as cli
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab import statistics
 from uard.lab.cell import Cell
@@ -18,6 +18,7 @@ from uard.lab.execution.store import Store
 from uard.lab.views import leaderboard
 from uard.lab.views.leaderboard import Estimate, Line, lines, standings
 from uard.method.mitigations import named
+from uard.ratings.panels import as_panel, name_of
 
 GRID = TrapGrid(size=4, traps=((1, 2),), horizon=12)
 HEADS = [
@@ -49,7 +50,7 @@ def board(tmp_path_factory):
     store = Store(folder / "s.sqlite")
     settings = [("main", 0.0), ("appendix", 0.5), ("colluding", 0.0)]
     cells = [
-        Cell(where, named(name), panel=panel, noise=noise, episodes=150)
+        Cell(where, named(name), panel=as_panel(panel), noise=noise, episodes=150)
         for where in (GRID, TrapGrid(size=4, traps=((1, 2),), horizon=12, legitimate=True), TrapGrid(6))
         for panel, noise in (settings[:2] if where is not GRID else settings)
         for name in ("raw", "uard", "uard-paper", "lcb")
@@ -117,7 +118,7 @@ def _where_of(cell):
     env = cell.environment
     name = "TrapGrid6-Legitimate" if env.legitimate else "TrapGrid"
     name = "TrapGrid6" if env.size == 6 else f"{name}, goal [3,3], horizon 12, size 4, traps [[1,2]]"
-    return name, "–" if _name(cell) == "raw" else cell.panel, cell.noise
+    return name, "–" if _name(cell) == "raw" else name_of(cell.panel), cell.noise
 
 
 def test_intervals_of_many_samples_are_those_of_one(monkeypatch):

@@ -1,5 +1,6 @@
 import importlib
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -10,14 +11,16 @@ import pytest
 from uard import InvalidValueError, plugins
 from uard._checks import UnknownNameError
 from uard.agents.tabular import QLearning
-from uard.cli.app import main as cli
+from uard.cli import app as cli
+from uard.cli import settings
 from uard.lab import registry as names
 from uard.lab import studies
 from uard.lab.cell import Cell
 from uard.lab.execution import runner
 from uard.lab.execution.store import Store
 from uard.lab.studies import plugins as own
-from uard.lab.views import leaderboard
+from uard.lab.views import leaderboard, sections
+from uard.lab.views.evidence import Evidence
 from uard.method import mitigations as mitigation
 from uard.method.mitigations import Raw, named
 from uard.plugins import PluginError
@@ -27,7 +30,7 @@ pytestmark = pytest.mark.slow
 EXAMPLE = Path(__file__).parents[2] / "examples" / "uard-plugin-example"
 BROKEN = """
 from dataclasses import dataclass
-from uard.mitigation import Mitigation, Raw
+from uard.method.mitigations import Mitigation, Raw
 
 @dataclass(frozen=True)
 class Mine(Raw):
@@ -43,6 +46,35 @@ def three():
 
 def raises():
     raise RuntimeError("not today")
+
+@dataclass(frozen=True)
+class Command:
+    def run(self, console):
+        print("mine ran")
+
+def quits():
+    raise SystemExit(0)
+
+def taken():
+    return {"mine": (study("control"),)}
+
+def named_like_a_study():
+    return {"matrix": (study("other"),)}
+
+def twice():
+    return {"mine": (study("new"), study("new"))}
+
+def study(name):
+    from uard.lab.cell import Cell
+    from uard.lab.study import Study, row
+    return Study(name, "t", "a", (row(Cell(), a=1),))
+
+def sections(evidence):
+    return [evidence.get("no such study", "trap_visits")]
+
+def made_already(evidence):
+    from uard.lab.views.sections import Section
+    return [Section("made", "Made", 1, "<p>twice</p>")]
 """
 ENTRIES = """
 [uard.mitigations]
@@ -57,6 +89,23 @@ twice = uard_broken:Mine
 nowhere = uard_broken:Mine
 [uard.agents]
 sac = uard_broken:Mine
+[uard.commands]
+run = uard_broken:Command
+thaw = uard_broken:Thawed
+lost = uard_broken:Nothing
+[uard.studies]
+absent = no_such_module:studies
+quits = uard_broken:quits
+mine = uard_broken:three
+control = uard_broken:taken
+group = uard_broken:named_like_a_study
+twice = uard_broken:twice
+[uard.results]
+odd = uard_broken:three
+[uard.reports]
+gone = uard_broken:Nothing
+late = uard_broken:sections
+made = uard_broken:made_already
 """
 
 
@@ -112,13 +161,30 @@ def test_they_are_listed_with_their_package(example, capsys):
 def test_broken_ones_are_told_and_disturb_nobody(broken, capsys):
     names_, _, err = listed(capsys)
     assert names_ >= {"ceiling", "BellCorridor", "softmax-dqn", *mitigation.NAMED}
-    warnings = sorted(line.removeprefix("warning: ") for line in err.splitlines())
-    assert [w.split(":")[0].split(" = ")[1] for w in warnings] == [
-        "'sac'",
-        "'nowhere'",
-        *("'gone'", "'missing'", "'raises'", "'raw'", "'thawed'", "'three'", "'twice'", "'twice'"),
+    warnings = [line.removeprefix("warning: ") for line in err.splitlines()]
+    assert sorted(w.split(": must be usable")[0] for w in warnings) == [
+        "agent = 'sac'",
+        *(f"command = {name!r}" for name in ("lost", "run", "thaw")),
+        "environment = 'nowhere'",
+        *(f"mitigation = {n!r}" for n in ("gone", "missing", "raises", "raw", "thawed", "three", "twice", "twice")),
+        "report = 'gone'",
+        "results = 'odd'",
+        *(f"studies = {name!r}" for name in ("absent", "control", "group", "mine", "quits", "twice")),
     ]
     assert all("of package broken 1.0: " in w or "of package other 1.0: " in w for w in warnings)
+    for says in (
+        "package broken 1.0: the name is uard's own command",
+        "Thawed'> is no frozen dataclass with a method run",
+        "AttributeError: module 'uard_broken' has no attribute 'Nothing'",
+        "ModuleNotFoundError: No module named 'no_such_module'",
+        "SystemExit: 0",
+        "3 is no dictionary of groups, (Study, ...) by name",
+        "the name of its study 'control' is taken",
+        "the name of its group 'matrix' is that of a study",
+        "the name of its study 'new' is taken",
+        "3 is no ResultFiles",
+    ):
+        assert any(says in w for w in warnings), says
 
 
 @pytest.mark.parametrize(
@@ -147,7 +213,7 @@ def test_what_is_of_another_kind_or_has_our_name_is_not_taken(broken):
 
 
 def test_fields_are_set_like_those_of_ours(example):
-    assert names.mitigation_named("ceiling", {"slack": 1}) == named("ceiling", slack=1.0) == example.Ceiling(1.0)
+    assert settings.mitigation("ceiling", {"slack": 1}) == named("ceiling", slack=1.0) == example.Ceiling(1.0)
     assert names.environment("BellCorridor", {"length": 11}) == example.BellCorridor(11)
     assert names.agent("softmax-dqn", {"heat": 1, "network.hidden": 16}).network.hidden == 16
     with pytest.raises(InvalidValueError, match="slack = -1"):
@@ -160,8 +226,8 @@ def test_fields_are_set_like_those_of_ours(example):
 def test_a_cell_is_keyed_by_class_and_fields(example):
     cell = Cell(example.BellCorridor(), example.Ceiling())
     config = cell.config()
-    assert config["mitigation"] == {"class": "uard_plugin_example.Ceiling", "slack": 0.5}
-    assert config["environment"]["class"] == "uard_plugin_example.BellCorridor"
+    assert config["mitigation"] == {"class": "Ceiling", "slack": 0.5}
+    assert config["environment"]["class"] == "BellCorridor"
     others = [
         cell.with_(mitigation=example.Ceiling(0.4)),
         cell.with_(environment=example.BellCorridor(legitimate=True)),
@@ -250,6 +316,64 @@ def test_what_packages_bring_has_a_study(example):
     assert len(study.rows) == len(everywhere) * len(own.mitigations())
     assert all(r.cell.environment.legitimate == r["environment"].endswith("legitimate") for r in study.rows)
     assert isinstance(study.rows[0].cell.agent, QLearning)
+
+
+def test_studies_of_packages_stand_beside_ours(example, broken, capsys):
+    groups = studies.groups()
+    assert [s.name for s in groups["bells"]] == ["loudness"]
+    assert groups.keys() >= {"grid", "games", "plugins", "grid-deep", "mujoco-standard"}
+    assert {s.name for s in groups["grid"]} > {"matrix", "control", "scale", "table5"}, "groups of one name are joined"
+    assert [s.name for s in studies.find(("loudness",))] == [s.name for s in studies.find(("bells",))] == ["loudness"]
+    assert {"loudness"} <= listed(capsys)[0]
+
+
+def test_a_command_of_a_package_runs_and_none_takes_the_name_of_ours(installed, broken, capsys):
+    cli.main(["bells", "--bell", "4"])
+    out, err = capsys.readouterr()
+    assert out == "2.5 rings pay as much as the goal\n"
+    assert sum("warning: command = " in line for line in err.splitlines()) == 3
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(["bells", "--bell", "-1"])
+    assert stopped.value.code == 2
+    assert "error: bell = -1.0: must be a number > 0" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(["run", "--help"])
+    assert stopped.value.code == 0
+    assert "Train one agent" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(["nonsense"])
+    assert stopped.value.code == 2
+    assert "bells" in capsys.readouterr().err, "the error says what exists"
+
+
+def test_sections_of_packages_join_the_report(broken, tmp_path):
+    """Made from evidence without numbers where none is needed: what is tested is who gets onto the page."""
+    store = Store(":memory:")
+    (control,) = studies.find(("control",))
+    runner.run(control.jobs(range(2)), store, workers=1)
+    evidence = Evidence(store, range(2), studies.grid())
+    good, bad = sections.of_packages(evidence, [sections.Section("made", "How this was made", 1000, "")])
+    (section,) = (s for s in good if s.id == "example")
+    assert "a random walker, 6x6" in section.html
+    assert section.losses == ("Nobody has tried uard on bells of 1000.",)
+    why = {error.plugin.name: str(error) for error in bad}
+    assert "AttributeError" in why["gone"]
+    assert "KeyError: 'no such study'" in why["late"]
+    assert "the name 'made' of its section or file is taken" in why["made"]
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"id": "Two words"}, "id = 'Two words': must be small letters"),
+        ({"order": float("nan")}, "order = nan: must be a finite number"),
+        ({"files": {"../up": ""}}, "files = '../up': must be a plain name"),
+        ({"files": {"index.html": ""}}, "files = 'index.html': must be a plain name, none of index.html"),
+    ],
+)
+def test_silly_sections_are_refused(fields, says):
+    with pytest.raises(InvalidValueError, match=re.escape(says)):
+        sections.Section(**({"id": "x", "title": "t", "order": 1, "html": ""} | fields))
 
 
 def test_nothing_is_imported_before_it_is_asked_for(installed):

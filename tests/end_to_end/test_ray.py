@@ -10,7 +10,8 @@ import pytest
 
 from uard import InvalidValueError, LearningSignal, Mitigation
 from uard.agents.tabular import QLearning
-from uard.cli.app import main as cli
+from uard.cli import app as cli
+from uard.cli.reproduce import Reproduce
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
 from uard.lab.execution import cluster, runner
@@ -177,9 +178,9 @@ def test_a_share_of_gpus_that_is_none_is_refused(gpus):
 
 
 def test_the_command_line_says_which_cluster():
-    command = cli.Reproduce(engine="ray", address="head:6379", gpus=0.5)
-    assert cli._engine(command) == Ray("head:6379", 0.5)
-    assert cli._engine(cli.Reproduce()) is None
+    command = Reproduce(engine="ray", address="head:6379", gpus=0.5)
+    assert command._engine() == Ray("head:6379", 0.5)
+    assert Reproduce()._engine() is None
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ def made(shared):
             command = [UARD, "reproduce", "--seeds", "2", "--store", store, "--report", page.parent]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stderr
+            assert "warning" not in done.stderr, "nothing that joins the page is broken"
         return SimpleNamespace(page=page, store=store, ledger=json.loads((page.parent / "ledger.json").read_text()))
 
 
@@ -53,8 +54,10 @@ def test_the_ledger_answers_every_claim_once(made):
     for e in entries:
         assert e["verdict"] in VERDICTS
         assert len(e["why"]) > 10
+        assert e["parts"]
+        assert bool(e["count"]) == (e["verdict"] != "cannot be tested")
         assert len(e["statement"]) > 10
-        assert e["ran"]
+        assert e["source"]
         assert e["ours"]
         assert not NOT_A_NUMBER.search(e["ours"]), e
         assert (e["ours"] == "-") <= (e["verdict"] == "cannot be tested"), e
@@ -99,6 +102,18 @@ def test_every_link_leads_somewhere_and_every_image_is_there(page):
     images = page.eval_on_selector_all("img", "all => all.map(i => [i.alt, i.complete, i.naturalWidth])")
     assert len(images) >= 12, "the deep figures come with their published results"
     assert [i for i in images if not (i[0] and i[1] and i[2] > 0)] == []
+
+
+def test_the_navigation_names_every_section_in_order(page):
+    places = page.eval_on_selector_all("nav a", "links => links.map(a => a.getAttribute('href'))")
+    sections = page.eval_on_selector_all("h2", "heads => heads.map(h => '#' + h.id)")
+    assert [p for p in places if p.startswith("#")] == sections
+    assert [p for p in places if not p.startswith("#")] == ["leaderboard.html"]
+    assert sections.index("#short") < sections.index("#losses") < sections.index("#ours") < sections.index("#made")
+    losses = page.locator("#losses + ul li").all_inner_texts()
+    assert len(losses) > 12
+    for says in ("Colluding raters", "Deep agents on 10x10", "Reward-gaming gridworlds", "MuJoCo", "Best-of-n"):
+        assert any(loss.startswith(says) for loss in losses), says
 
 
 def test_the_canvases_draw(page):

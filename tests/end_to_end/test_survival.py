@@ -24,12 +24,12 @@ KILLS = int(os.environ.get("UARD_KILLS", "8"))
 JOBS, WORKERS = 30, 2
 DRIVER = """
 import signal, sys
-from uard.lab import runner
-from uard.lab.store import Store
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store
 from test_survival import walks
 
 if __name__ == "__main__":
-    from uard import cli
+    from uard.cli import app as cli
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with cli._terminable():
         print(runner.run(walks(), Store(sys.argv[1]), int(sys.argv[2]), lambda *x: print(*x, flush=True)), flush=True)
@@ -39,10 +39,10 @@ if __name__ == "__main__":
 STARTER = """
 import os, signal, sys, warnings
 import jax
-from uard import cli
-from uard.lab import finish, runner
-from uard.lab.store import Store
-from uard.training import fused
+from uard.cli import app as cli
+from uard.lab.execution import finish, runner
+from uard.lab.execution.store import Store
+from uard.training.compiled import tabular
 from test_survival import walks
 
 warnings.simplefilter("ignore", RuntimeWarning)  # of os.fork: nothing has been computed here

@@ -65,7 +65,7 @@ def test_a_disk_that_is_full_leaves_the_last_good_one(saved, monkeypatch):
     def full(_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(checkpoint.os, "fsync", full)
+    monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OSError, match="No space"):
         checkpoint.save(saved, "cell 3", STATE)
     assert saved.read_bytes() == before

@@ -26,6 +26,7 @@ from uard.lab.study import Study, row
 from uard.lab.views import published
 from uard.lab.views.published import BIN, Published, checkout, extract, packaged
 from uard.method.mitigations import named
+from uard.ratings.panels import PANELS
 from uard.replication import distortion
 from uard.training.feedback.rating_model import RatingModel
 
@@ -34,7 +35,9 @@ GRID = TrapGrid(size=4, traps=((1, 2),), horizon=12)
 
 
 def small(**changes):
-    return Cell(GRID, named("uard"), SMALL, episodes=20, feedback=RatingModel(2, 8, fits=2, batch=16)).with_(**changes)
+    return Cell(GRID, named("uard"), SMALL, episodes=20, rating_model=RatingModel(2, 8, fits=2, batch=16)).with_(
+        **changes
+    )
 
 
 def test_an_agent_that_cannot_work_is_refused_with_those_that_can():
@@ -49,8 +52,8 @@ def test_an_agent_that_cannot_work_is_refused_with_those_that_can():
     ("changes", "message"),
     [
         ({"snapshots": 2}, "snapshots = 2: must be 0 for an agent"),
-        ({"feedback": "table"}, "feedback = 'table': must be a RatingModel"),
-        ({"agent": QLearning()}, "feedback = .*must be none for a tabular agent"),
+        ({"rating_model": "table"}, "rating_model = 'table': must be a RatingModel"),
+        ({"agent": QLearning()}, "rating_model = .*must be none for a tabular agent"),
         ({"agent": "dqn"}, "agent = 'dqn': must be a frozen dataclass"),
         ({"environment": "CartPole"}, "environment = 'CartPole'"),
     ],
@@ -61,11 +64,11 @@ def test_bad_cells_are_refused(changes, message):
 
 
 def test_the_rating_model_is_part_of_the_key_and_its_absence_is_not():
-    assert small().key != small(feedback=None).key
-    assert small().key != small(feedback=RatingModel(3, 8, fits=2, batch=16)).key
-    assert "feedback" not in small(feedback=None).config()
+    assert small().key != small(rating_model=None).key
+    assert small().key != small(rating_model=RatingModel(3, 8, fits=2, batch=16)).key
+    assert "rating_model" not in small(rating_model=None).config()
     deaf = small(mitigation=named("raw"))
-    assert deaf.feedback is None, "an agent that hears nobody has no model of them"
+    assert deaf.rating_model is None, "an agent that hears nobody has no model of them"
 
 
 def test_all_deep_agents_share_network_budget_and_discount():
@@ -125,7 +128,12 @@ def test_a_diverging_run_is_named_kept_out_and_leaves_its_last_good_state(tmp_pa
 def test_published_results_come_back_and_stale_ones_do_not():
     store, cell = Store(":memory:"), small()
     runner.run([(cell, s) for s in range(3)], store, workers=1)
-    study = Study("deep-baselines", "t", "", (row(cell, agent="a"), row(small(noise=0.1), agent="b")))
+    rows = row(cell, agent="a"), row(small(noise=0.1), agent="b")
+
+    def derive(cell, found):
+        return {"largest": [r.metrics()["trap_visits"] / 3 for r in found.values()]}
+
+    study = Study("deep-baselines", "t", "", rows, ("trap_visits",), derive)
     data = json.loads(json.dumps(extract((study,), store, range(3), "made so")))
     back = Published((study,), [data])
     assert [r["agent"] for r in back.rows("deep-baselines")] == ["a"]
@@ -133,6 +141,9 @@ def test_published_results_come_back_and_stale_ones_do_not():
     np.testing.assert_allclose(back.per_seed(study.rows[0], "trap_visits"), expected, rtol=1e-5)
     assert back.curves(study.rows[0], "trap_visits").shape == (3, 20 // BIN)
     assert back.derived(study.rows[0], "rating_error").shape == (3, 5)
+    np.testing.assert_allclose(back.derived(study.rows[0], "largest"), np.array(expected) / 3, rtol=1e-5)
+    assert list(data["cells"]) == [cell.key]
+    assert list(data["cells"][cell.key]["curves"]) == ["trap_visits"]
     assert back.sources[0]["command"] == "made so"
     assert back.sources[0]["commit"] == checkout()
     with pytest.raises(LookupError, match="not published"):
@@ -178,7 +189,7 @@ def test_distortion_counts_only_windows_and_never_the_goal():
 
 def test_a_learned_reward_is_right_where_it_was_rated_and_in_doubt_elsewhere():
     spec = LearnedRewardGrid(model_seed=1)
-    task, truth, said = spec.task(), spec.truth(), spec.speech("main", 0.0)
+    task, truth, said = spec.task(), spec.truth(), spec.rating_law(PANELS["main"])
     reach = np.asarray(said.reach) > 0
     mean_rating = said.centre.mean(-1)
     assert np.abs(task.reward - mean_rating)[reach].max() < 0.1
@@ -187,7 +198,7 @@ def test_a_learned_reward_is_right_where_it_was_rated_and_in_doubt_elsewhere():
     assert truth.hack[~reach].any(), "so does extrapolation"
     assert (LearnedRewardGrid(model_seed=2).task().reward != task.reward).any()
     honest = LearnedRewardGrid(unrated=0)
-    assert honest.speech("main", 0.0).reach.all()
+    assert honest.rating_law(PANELS["main"]).reach.all()
 
 
 @pytest.mark.parametrize(

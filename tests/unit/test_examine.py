@@ -17,6 +17,7 @@ from uard.lab.study import Study, row
 from uard.lab.views.published import Published, extract
 from uard.method.mitigations import Raw, named
 from uard.replication import locomotion
+from uard.replication.studies import derive
 from uard.training.feedback.transition_model import TransitionModel
 from uard.training.host import loop as host
 
@@ -116,10 +117,10 @@ def test_the_study_is_published_and_shown():
         "sunrise": (sunrise(3, **OFF), Raw()),
     }
     rows = tuple(
-        row(Cell(WHERE, mitigation, agent, steps=256, feedback=SMALL, rated=0.1 * i), agent=name, critics="3")
+        row(Cell(WHERE, mitigation, agent, steps=256, rating_model=SMALL, rated=0.1 * i), agent=name, critics="3")
         for i, (name, (agent, mitigation)) in enumerate(agents.items())
     )
-    study = Study(locomotion.DISTORTION, "t", "G12", rows)
+    study = Study(locomotion.DISTORTION, "t", "G12", rows, derive=derive.reactions)
     runner.run([(r.cell, 0) for r in rows], store, workers=1)
     data = extract((study,), store, [0], "made so")
     others = [s for s in studies.every() if s.name != study.name]

@@ -1,9 +1,11 @@
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import uard
+import uard.adapters
 
 HEAVY = ("jax", "torch", "gymnasium", "scipy", "matplotlib")
 
@@ -30,6 +32,57 @@ def test_import_is_fast():
 )
 def test_the_method_needs_nothing_heavy(use):
     assert run(f"import sys, uard; {use}\nprint([m for m in {HEAVY} if m in sys.modules])").strip() == "[]"
+
+
+ADAPTERS = sorted(
+    f"uard.adapters.{found.relative_to(place).with_suffix('').as_posix().replace('/', '.').removesuffix('.__init__')}"
+    for place in map(Path, uard.adapters.__path__)
+    for found in place.rglob("*.py")
+    if found.parent != place or found.stem != "__init__"
+)
+
+
+@pytest.mark.parametrize("module", ["uard.adapters", *ADAPTERS, "uard.cli", "uard.cli.app", "uard.plugins"])
+def test_adapters_and_the_command_line_are_imported_without_jax(module):
+    code = f"import sys, warnings; warnings.simplefilter('ignore'); import {module}"  # others' warnings are theirs
+    assert run(f"{code}; print('jax' in sys.modules)") == "False\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--help"],
+        ["doctor", "log.csv"],
+        ["doctor", "log.csv", "--set-mitigation", "kappa=0", "--json", "out.json"],
+        ["doctor", "none.csv"],
+        ["doctor", "--nope"],
+        ["reproduce", "--help"],
+    ],
+)
+def test_the_doctor_and_help_load_no_jax(arguments, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rows = "".join(f"{i / 50},{i / 50},{i / 50 + 0.01}\n" for i in range(50))
+    (tmp_path / "log.csv").write_text(f"reward,rating_a,rating_b\n{rows}")
+    code = f"""
+import sys
+from uard.cli.app import main
+try:
+    main({arguments})
+except SystemExit:
+    pass
+print([m for m in ("jax", "optax", "matplotlib", "uard.lab.registry") if m in sys.modules], file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.splitlines()[-1] == "[]"
+
+
+def test_without_the_laboratory_commands_say_what_to_install():
+    code = "import sys; sys.modules[{0!r}] = None; from uard.cli.app import main; main({1!r})"
+    for missing, arguments in (("tyro", ["list"]), ("jax", ["list"]), ("rich", ["doctor", "x.csv"])):
+        command = [sys.executable, "-c", code.format(missing, arguments)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert done.stderr.startswith("the laboratory is not installed: pip install 'uard[lab]' (")
 
 
 @pytest.mark.parametrize("name", uard.__all__)

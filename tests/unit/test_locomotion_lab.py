@@ -23,6 +23,7 @@ from uard.lab.result import METRICS
 from uard.lab.studies import every
 from uard.lab.views.published import Published, packaged_json
 from uard.method.mitigations import Raw, named
+from uard.ratings.panels import PANELS
 from uard.replication import locomotion as shown
 from uard.replication.studies import locomotion
 from uard.training.feedback.rating_model import RatingModel
@@ -37,14 +38,14 @@ def cell(**changes):
 
 
 def test_a_cell_knows_what_matters_of_it():
-    assert cell(feedback=TransitionModel()).key == cell().key
+    assert cell(rating_model=TransitionModel()).key == cell().key
     assert cell(episodes=7).key == cell().key, "episodes mean nothing here"
     assert cell(steps=513).key != cell().key
     assert cell(steps=None).steps == 1_000_000
     assert cell(environment=dataclasses.replace(WHERE, version=5)).key != cell().key
     assert cell(query="doubtful").key != cell().key
     assert "query" not in cell().config(), "keys of earlier cells are what they were"
-    raw = cell(mitigation=Raw(), panel="appendix", rated=0.5, query="doubtful")
+    raw = cell(mitigation=Raw(), panel=PANELS["appendix"], rated=0.5, query="doubtful")
     assert raw.key == cell(mitigation=Raw()).key, "nobody is asked"
     assert "steps" not in Cell().config(), "keys of the grids' cells are what they were"
     curved = dataclasses.replace(TINY, network=dataclasses.replace(TINY.network, activation="tanh"))
@@ -60,7 +61,7 @@ def test_a_cell_knows_what_matters_of_it():
         ({"agent": names.AGENTS["dqn"]}, "ppo, trpo"),
         ({"environment": TrapGrid(), "agent": ensemble_sac(), "steps": None}, "discrete: q-learning"),
         ({"environment": TrapGrid(), "agent": QLearning(), "steps": 10}, "episodes"),
-        ({"feedback": RatingModel()}, "TransitionModel"),
+        ({"rating_model": RatingModel()}, "TransitionModel"),
         ({"steps": 0}, "steps"),
         ({"query": "sometimes"}, "random"),
         (

@@ -4,10 +4,11 @@ import pytest
 
 from uard import InvalidValueError
 from uard._checks import UnknownNameError
+from uard._support.fields import changed
 from uard.agents.tabular import QLearning
+from uard.cli.settings import mitigation, settings
 from uard.envs.grids.trapgrid import PAPER_HORIZON, PAPER_TRAPS, TrapGrid
 from uard.lab import registry as names
-from uard.lab.registry import changed, settings
 from uard.method.abstention import Abstention
 from uard.method.mitigations import NAMED, RatedReward, RewardDiscounting, named
 
@@ -130,7 +131,7 @@ def test_a_silly_size_is_refused(size):
 
 @pytest.mark.parametrize("name", NAMED)
 def test_every_mitigation_comes_as_named(name):
-    assert names.mitigation_named(name, {}) == named(name)
+    assert mitigation(name, {}) == named(name)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +148,7 @@ def test_every_mitigation_comes_as_named(name):
     ],
 )
 def test_mitigations_take_the_filters_settings_as_their_own(name, changes, expected):
-    assert names.mitigation_named(name, changes) == expected
+    assert mitigation(name, changes) == expected
 
 
 @pytest.mark.parametrize(
@@ -165,7 +166,7 @@ def test_mitigations_take_the_filters_settings_as_their_own(name, changes, expec
 )
 def test_mitigations_refuse(name, changes, message):
     with pytest.raises(InvalidValueError, match=message):
-        names.mitigation_named(name, changes)
+        mitigation(name, changes)
 
 
 def test_agents():
@@ -189,14 +190,9 @@ def test_abstention_is_set_by_its_parts(value):
         (lambda n: names.environment(n, {}), "trapgrid", "TrapGrid"),
         (lambda n: names.agent(n, {}), "qlearning", "q-learning"),
         (lambda n: names.agent(n, {}), "randomwalk", "random-walk"),
-        (lambda n: names.mitigation_named(n, {}), "uardpaper", "uard-paper"),
-        (names.panel, "apendix", "appendix"),
+        (lambda n: mitigation(n, {}), "uardpaper", "uard-paper"),
     ],
 )
 def test_unknown_names_suggest_the_nearest(look_up, wrong, right):
     with pytest.raises(UnknownNameError, match=rf"= '{wrong}': must be one of .*\(did you mean '{right}'\?\)"):
         look_up(wrong)
-
-
-def test_known_panels_pass():
-    assert names.panel("appendix") == "appendix"

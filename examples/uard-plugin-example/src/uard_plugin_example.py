@@ -1,4 +1,4 @@
-"""A mitigation, an environment and an agent that uard knows as soon as this package is installed."""
+"""What uard knows as soon as this package is installed: a mitigation, an environment, an agent, a study, a section."""
 
 from __future__ import annotations
 
@@ -11,8 +11,15 @@ import numpy as np
 
 from uard import InvalidValueError, LearningSignal, Mitigation
 from uard.agents.value import DeepQ
-from uard.envs.tables import HiddenTruth, Ratings, Task
-from uard.ratings import panels
+from uard.envs.base import TableEnvironment
+from uard.envs.tables import HiddenTruth, Task
+from uard.lab.cell import Cell
+from uard.lab.study import Study, row
+from uard.lab.views.evidence import Evidence
+from uard.lab.views.sections import Section
+from uard.lab.views.tables import Table, full
+from uard.lab.views.templates import table
+from uard.method.mitigations import Raw, named
 
 
 @dataclass(frozen=True)
@@ -30,7 +37,7 @@ class Ceiling(Mitigation):
         if not self.slack >= 0:
             raise InvalidValueError("slack", self.slack, "a number >= 0")
 
-    def signal(self, evidence: Any, usual: Any) -> LearningSignal:
+    def signal(self, evidence: Any, statistics: Any) -> LearningSignal:
         """Return the smaller of reward and ceiling."""
         known = evidence.feedback.count > 0
         ceiling = jnp.where(known, evidence.feedback.mean, 0.0) + self.slack
@@ -38,7 +45,7 @@ class Ceiling(Mitigation):
 
 
 @dataclass(frozen=True)
-class BellCorridor:
+class BellCorridor(TableEnvironment):
     """A corridor with the goal at its far end and a bell in its middle, which pays for every ring and is worth nothing.
 
     Actions: 0 back, 1 on, 2 ring (nothing happens where there is no bell).
@@ -83,14 +90,6 @@ class BellCorridor:
         worth = np.where(rings & (not self.legitimate), np.float32(-1.0), task.reward)
         return HiddenTruth(worth, rings, task.terminal)
 
-    def speech(self, panel: str, noise: float) -> Ratings:
-        """Return what a panel says of every step."""
-        return panels.ratings(panel, self.task(), self.truth(), noise)
-
-    def world(self, panel: str = "main", noise: float = 0.0) -> Any:
-        """Return the compiled world, for deep agents."""
-        return panels.of_tables(self, panel, noise)
-
 
 @dataclass(frozen=True)
 class SoftmaxDQN(DeepQ):
@@ -108,8 +107,27 @@ class SoftmaxDQN(DeepQ):
         if not self.heat > 0:
             raise InvalidValueError("heat", self.heat, "a number > 0")
 
-    def act(self, state: Any, observation: Any, prefer: Any, episode: Any, key: Any) -> Any:
+    def act(self, state: Any, observation: Any, score_fn: Any, episode: Any, key: Any) -> Any:
         """Draw an action for one observation."""
         choice, dropout = jax.random.split(key)
         mu, sigma = self.read(state, observation[None], dropout)
-        return jax.random.categorical(choice, prefer(mu, sigma, observation[None])[0] / self.heat).astype(jnp.int32)
+        return jax.random.categorical(choice, score_fn(mu, sigma, observation[None])[0] / self.heat).astype(jnp.int32)
+
+
+def studies() -> dict[str, tuple[Study, ...]]:
+    """Return groups of studies by name: what ``uard reproduce bells`` runs."""
+    rivals: dict[str, Mitigation] = {"raw": Raw(), "ceiling": Ceiling(), "uard": named("uard")}
+    rows = tuple(
+        row(Cell(BellCorridor(bell=bell), mitigation), bell=bell, mitigation=name)
+        for bell in (0.5, 2.0, 8.0)
+        for name, mitigation in rivals.items()
+    )
+    return {"bells": (Study("loudness", "How loud may a bell be?", "an example", rows),)}
+
+
+def sections(evidence: Evidence) -> list[Section]:
+    """Return what joins the report; ``evidence`` holds all studies of the group ``grid``."""
+    (walker, *_) = evidence.studies["control"].rows
+    rows = (("a random walker, 6x6", full(evidence.of(walker.cell, "trap_visits"))),)
+    shown = table(Table("What nobody has to learn", ("who", "trap visits per episode"), rows))
+    return [Section("example", "An example", 200, shown, losses=("Nobody has tried uard on bells of 1000.",))]

@@ -1,13 +1,13 @@
-"""Names that the command line and studies use, and how ``--set`` changes what they stand for."""
+"""Names that the command line and studies use, and what they stand for."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable
 from typing import Any
 
 from uard import _checks, plugins
+from uard._support.fields import changed
 from uard.agents import continuous
 from uard.agents.actor_critic import SoftActorCritic, edac
 from uard.agents.continuous import ContinuousActorCritic
@@ -23,8 +23,6 @@ from uard.envs.grids.trapgrid import TrapGrid
 from uard.envs.locomotion.physics import Locomotion, Posture, Vibration
 from uard.method import mitigations as mitigation
 from uard.method.abstention import Abstention
-from uard.method.mitigations import Mitigation
-from uard.ratings.panels import PANELS
 from uard.training.feedback.rating_model import RatingModel
 
 ENVIRONMENTS: dict[str, Any] = {
@@ -152,66 +150,13 @@ IS_ONE: dict[str, Callable[[Any], bool]] = {
 
 def brought(kind: str) -> tuple[dict[plugins.Plugin, Any], list[plugins.PluginError]]:
     """Return what other packages bring of a kind ("environment", "agent", "mitigation"), and what of it is broken."""
-    good: dict[plugins.Plugin, Any] = {}
-    bad = plugins.clashes(kind, OWN[kind])
-    for plugin in plugins.usable(kind, OWN[kind]).values():
-        try:
-            good[plugin] = plugin.load(IS_ONE[kind])()
-        except plugins.PluginError as error:
-            bad.append(error)
-    return good, bad
+    return plugins.brought(kind, lambda plugin: plugin.load(IS_ONE[kind])(), OWN[kind])
 
 
 def _of(kind: str, name: str, ours: dict[str, Any]) -> Any:
     if name in ours:
         return ours[name]
     return plugins.pick(kind, name, OWN[kind], [*ours]).load(IS_ONE[kind])()
-
-
-def settings(pairs: tuple[str, ...], option: str = "--set") -> dict[str, Any]:
-    """Read ``name=value`` pairs; values are JSON, or else text.
-
-    Raises:
-        InvalidValueError: a pair without ``=``.
-    """
-    out: dict[str, Any] = {}
-    for pair in pairs:
-        name, sign, value = pair.partition("=")
-        if not sign or not name:
-            raise _checks.InvalidValueError(option, pair, "name=value, such as size=12 or 'traps=[[2,5],[7,3]]'")
-        try:
-            out[name] = json.loads(value)
-        except json.JSONDecodeError:
-            out[name] = value
-    return out
-
-
-def changed(base: Any, changes: dict[str, Any], what: str) -> Any:
-    """Return a frozen dataclass with some fields changed; nested ones by dotted names.
-
-    Raises:
-        UnknownNameError: an unknown field, with the nearest known one.
-    """
-    fields = {f.name: f for f in dataclasses.fields(base) if f.init}
-    given: dict[str, Any] = {}
-    for name, value in changes.items():
-        head, _, rest = name.partition(".")
-        if head not in fields:
-            raise _checks.UnknownNameError(f"{what} setting", name, fields)
-        old = given.get(head, getattr(base, head))
-        parts = [f"{head}.{f.name}" for f in dataclasses.fields(old)] if dataclasses.is_dataclass(old) else []
-        if bool(rest) != bool(parts):
-            raise _checks.InvalidValueError(f"{what} setting", name, f"one of {', '.join(parts)}" if parts else head)
-        if rest:
-            value = changed(old, {rest: value}, f"{what}.{head}")
-        elif isinstance(old, bool) and not isinstance(value, bool):
-            raise _checks.InvalidValueError(f"{what} setting {name}", value, "true or false")
-        elif isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        elif isinstance(value, list):
-            value = tuple(tuple(v) if isinstance(v, list) else v for v in value)
-        given[head] = value
-    return dataclasses.replace(base, **given)
 
 
 def environment(name: str, changes: dict[str, Any]) -> Any:
@@ -252,18 +197,3 @@ def rating_model(name: str | None, of: Agent, environment: Any = None) -> Rating
     if name is None:
         return None if isinstance(of, QLearning) else RatingModel()
     return RatingModel() if _checks.choose("feedback", name, ("model", "table")) == "model" else None
-
-
-def mitigation_named(name: str, changes: dict[str, Any]) -> Mitigation:
-    """Return a mitigation by name, some fields changed (``filter.lam`` and the like for the filter's)."""
-    base: Any = mitigation.named(name)
-    short = {f.name for f in dataclasses.fields(base.filter)} if hasattr(base, "filter") else set()
-    known = short | {f.name for f in dataclasses.fields(base)}
-    for setting in changes:
-        _checks.choose("mitigation setting", setting.partition(".")[0], known)
-    return changed(base, {f"filter.{k}" if k in short else k: v for k, v in changes.items()}, "mitigation")
-
-
-def panel(name: str) -> str:
-    """Return a panel's name if there is one."""
-    return _checks.choose("panel", name, PANELS)

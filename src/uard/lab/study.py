@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,12 +37,17 @@ class Study:
         title: One line.
         answers: Inventory numbers (F2, H5, G3 ...).
         rows: Its cells with their labels.
+        curves: Columns of the episode log that are published, binned, beside the metrics.
+        derive: What else is published of a cell: numbers by name, of the cell and its results by seed. For what needs
+            the whole result, which is too large to be published.
     """
 
     name: str
     title: str
     answers: str
     rows: tuple[Row, ...]
+    curves: tuple[str, ...] = ()
+    derive: Callable[[Cell, Mapping[int, Result]], dict[str, Any]] | None = None
 
     def jobs(self, seeds: Iterable[int]) -> list[tuple[Cell, int]]:
         """Return every (cell, seed), seeds outermost last so that a cell finishes as a whole."""

@@ -9,9 +9,12 @@ from uard.lab import statistics
 from uard.lab.execution.examine import WINDOWS
 from uard.lab.result import CALIBRATION, RATING_ERROR
 from uard.lab.study import Row
-from uard.lab.views.published import BIN, SIGMA_QUALITY, Published, packaged_json
-from uard.lab.views.tables import Table, brief, full, number
+from uard.lab.views.figures import COLOURS as PALETTE
+from uard.lab.views.figures import axes_of, data_uri
+from uard.lab.views.published import BIN, Published, packaged_json
+from uard.lab.views.tables import Table, brief, full
 from uard.replication import distortion, figures, paper
+from uard.replication.studies.derive import SIGMA_QUALITY
 
 AGENT = {"DQN": "dqn", "CQL": "cql", "CPO": "cpo", "TRPO": "trpo"}  # of the paper's Table 3
 COLOURS = {
@@ -23,7 +26,7 @@ COLOURS = {
 def tables(p: Published) -> list[Table]:
     """Return all tables for which there are results."""
     made = [_baselines(p), _competence(p), _mitigated(p), _rivals(p), _ablation(p), _ensembles(p), _feedback(p)]
-    made += [_distortion(p), *_games(p), _credentials(), _speed()]
+    made += [_distortion(p), _credentials(), _speed()]
     return [t for t in made if t.rows]
 
 
@@ -160,19 +163,6 @@ def losses(p: Published) -> list[str]:
         goals = p.per_seed(r, "goal_rate")
         if lost := int((goals < 0.5).sum()):
             out.append(f"uard lost the goal in {lost} of {len(goals)} runs: {where}.")
-    games = p.rows("gaming", mitigation="uard")
-    beaten = []
-    for r in games:
-        for rival in p.rows("gaming", game=r["game"], agent=r["agent"]):
-            theirs, own = p.of(rival, "true_return"), p.of(r, "true_return")
-            if rival["mitigation"] not in ("uard",) and theirs.ci95[0] > own.ci95[1]:
-                beaten.append(f"{r['game']}, {r['agent']}: {rival['mitigation']} {brief(theirs)} against {brief(own)}")
-    if games:
-        out.append(
-            f"Reward-gaming gridworlds: in {len(beaten)} comparisons over {len(games)} settings another mitigation, raw included, "
-            "has the higher true return" + (": " + "; ".join(beaten[:12]) if beaten else "")
-            + (f"; and {len(beaten) - 12} more (table below)" if len(beaten) > 12 else "") + "."
-        )  # fmt: skip
     return out
 
 
@@ -252,33 +242,6 @@ def _distortion(p: Published) -> Table:
     )
 
 
-def _games(p: Published) -> list[Table]:
-    made = []
-    names = list(dict.fromkeys(r["mitigation"] for r in p.rows("gaming")))
-    for game in dict.fromkeys(r["game"] for r in p.rows("gaming")):
-        rows = []
-        for agent in dict.fromkeys(r["agent"] for r in p.rows("gaming", game=game)):
-            cells = []
-            for name in names:
-                found = p.rows("gaming", game=game, agent=agent, mitigation=name)
-                cells.append(
-                    f"{number(p.of(found[0], 'true_return').mean)} ({number(p.of(found[0], 'trap_visits').mean)})"
-                    if found
-                    else "–"
-                )
-            rows.append((agent, *cells))
-        made.append(
-            Table(
-                f"{game}: true return (hacks) per episode",
-                ("agent", *names),
-                tuple(rows),
-                1,
-                f"Main panel, 100 episodes, {p.seeds('gaming')} seeds, means; – was not run.",
-            )
-        )
-    return made
-
-
 LIBRARIES = {"stable-baselines3": "Stable-Baselines3", "sbx-rl": "SBX"}
 
 
@@ -337,17 +300,17 @@ def drawn(p: Published) -> list[tuple[str, str, str]]:
         made.append(("G14, G15 · confidence-adjusted reward under distortion", note, _adjusted(p)))
         note = "Left: what each would learn from; right: lambda_t of uard, which rises where the reward contradicts the raters."
         made.append(("G12 · a hacking region, and lambda_t", note, figures.hacking_region(_trace(p, "uard"), WINDOWS)))
-    return [(title, note, figures.data_uri(figure)) for title, note, figure in made]
+    return [(title, note, data_uri(figure)) for title, note, figure in made]
 
 
 def _curves(p: Published) -> Figure:
-    figure, axes = figures._axes(2, 6.2, 4.2)
+    figure, axes = axes_of(2, 6.2, 4.2)
     for axis, column in zip(axes, ("observed_return", "trap_visits"), strict=True):
         for r in p.rows("deep-baselines", horizon=100):
             curve = p.curves(r, column).mean(0)
             raw = r["mitigation"] == "raw"
             label = r["agent"] if raw else f"{r['agent']} + {r['mitigation']}"
-            colour = COLOURS[r["agent"]] if raw else figures.COLOURS[r["mitigation"]]
+            colour = COLOURS[r["agent"]] if raw else PALETTE[r["mitigation"]]
             x = (np.arange(len(curve)) + 1) * BIN
             style = "-" if raw else ":" if r["agent"] == "ppo" else "--"
             axis.plot(x, curve, color=colour, lw=1.6 if raw else 2.4, ls=style, label=label)

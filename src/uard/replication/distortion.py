@@ -67,18 +67,22 @@ def walk(cell: Cell, result: Result, seed: int) -> Trace:
     observed = np.array(rewards) + BONUS * inside()
     counts = inside() & ~np.asarray(task.terminal)[rows, columns]
     if isinstance(cell.mitigation, RewardDiscounting):
-        heard = ("count", "mean", "lowest", "spread", "proxy")
-        known, every = (Feedback._make([*(tables[k] for k in heard), 3.0]) for tables in (at, held))
-        usual = cell.mitigation.usual(every, held["rated"] > 0)
-        adjusted = cell.mitigation.signal(Evidence(observed, at["sigma_m"], known), usual).reward
+        known, every = (_feedback(tables, len(cell.panel.raters)) for tables in (at, held))
+        evidence, rated = Evidence(observed, at["sigma_m"], known), held["rated"] > 0
+        why = cell.mitigation.explain(evidence, cell.mitigation.fit(every, rated))
         rival = RatedReward("bound")
-        caution = rival.signal(Evidence(observed, at["sigma_m"], known), rival.usual(every, held["rated"] > 0)).reward
-        lam = cell.mitigation.coefficient(cell.mitigation.disagreement(observed, known), usual)
-        return Trace(observed, np.asarray(adjusted), np.asarray(caution), np.asarray(lam), counts)
+        caution = rival.signal(evidence, rival.fit(every, rated)).reward
+        return Trace(observed, np.asarray(why.signal.reward), np.asarray(caution), np.asarray(why.lam), counts)
     if isinstance(cell.agent, DeepQ):
         weight = backup_trust(at["sigma_m"], cell.agent.temperature)
         return Trace(observed, weight * observed, observed, 0.0 * observed, counts)
     return Trace(observed, observed - (at["mu"] - at["lowest_value"]), observed, 0.0 * observed, counts)
+
+
+def _feedback(tables: dict[str, np.ndarray], raters: int) -> Feedback:
+    """Return what the agent had learned of its raters, all of whom answer every question."""
+    count, mean, lowest, sd, proxy = (tables[name] for name in ("count", "mean", "lowest", "spread", "proxy"))
+    return Feedback(count, mean, lowest, sd, proxy, raters * np.ones_like(count))
 
 
 def activations(trace: Trace) -> int:

@@ -1,62 +1,18 @@
-"""The paper's figures (G2-G5, G8, G9, G11-G16) from our runs, and ours. Every function returns a figure."""
+"""The paper's figures (G2-G5, G8, G9, G11-G16) from our runs. Every function returns a figure."""
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Sequence
-from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from uard.lab.study import Row
 from uard.lab.views.evidence import Evidence
+from uard.lab.views.figures import COLOURS, axes_of
 from uard.method.stability import DEFINITIONS, perturbed_advantage
 from uard.method.weights import exponential_weight, linear_weight, reciprocal_weight
 from uard.replication import paper, theory
-
-matplotlib.use("Agg")
-
-COLOURS = {
-    "baseline": "#c1272d",
-    "raw": "#c1272d",
-    "multi-head": "#e08214",
-    "uard-paper": "#2c6fbb",
-    "uard-consistent": "#7b4fa3",
-    "uard": "#1b8a4b",
-    "random walk": "#777777",
-    "mean-of-annotations": "#8c6d31",
-    "worst-of-annotations": "#17a2b8",
-    "lcb": "#d6589f",
-    "screening": "#999933",
-}
-_STYLE: Any = {
-    "font.size": 11,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.alpha": 0.25,
-    "figure.dpi": 110,
-    "legend.frameon": False,
-    "axes.titlesize": 12,
-}
-
-
-def data_uri(figure: Figure) -> str:
-    """Return a figure as a PNG that needs no file beside the page."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
-
-
-def _axes(columns: int = 1, width: float = 7.0, height: float = 3.8) -> tuple[Figure, list[Axes]]:
-    with matplotlib.rc_context(_STYLE):
-        figure = Figure(figsize=(width * columns, height), layout="constrained")
-        axes = figure.subplots(1, columns, squeeze=False)[0]
-    return figure, list(axes)
 
 
 def _smooth(curves: np.ndarray, width: int = 10) -> np.ndarray:
@@ -75,7 +31,7 @@ def _curve(axis: Axes, curves: np.ndarray, label: str, colour: str) -> None:
 
 def filters(e: Evidence) -> Figure:
     """G2: weights against uncertainty, and what each form does to the paper's trap."""
-    figure, (left, right) = _axes(2, 5.5)
+    figure, (left, right) = axes_of(2, 5.5)
     u = np.linspace(0, 5, 400)
     for label, weight in (
         ("reciprocal", reciprocal_weight(u)),
@@ -101,7 +57,7 @@ def filters(e: Evidence) -> Figure:
 
 
 def _training(e: Evidence, column: str, agents: Sequence[str], ylabel: str, title: str) -> Figure:
-    figure, axes = _axes(2, 5.8)
+    figure, axes = axes_of(2, 5.8)
     for axis, panel in zip(axes, ("main", "appendix"), strict=True):
         for agent in agents:
             _curve(axis, e.curves("table4", column, agent=agent, panel=panel), agent, COLOURS[agent])
@@ -127,7 +83,7 @@ def trap_visits(e: Evidence) -> Figure:
 
 def alignment_gap(e: Evidence) -> Figure:
     """G5: observed and true return of the baseline drift apart; of ``uard`` they do not."""
-    figure, axes = _axes(2, 5.8)
+    figure, axes = axes_of(2, 5.8)
     for axis, agent in zip(axes, ("baseline", "uard"), strict=True):
         _curve(axis, e.curves("table4", "observed_return", agent=agent, panel="main"), "observed", "#2c6fbb")
         _curve(axis, e.curves("table4", "true_return", agent=agent, panel="main"), "true", "#e08214")
@@ -143,7 +99,7 @@ def true_return(e: Evidence) -> Figure:
 
 def uncertainty(e: Evidence) -> Figure:
     """G9: both uncertainties over training, at the trap and elsewhere."""
-    figure, axes = _axes(2, 5.8)
+    figure, axes = axes_of(2, 5.8)
     for axis, panel in zip(axes, ("main", "appendix"), strict=True):
         row = e.row("uncertainty", agent="uard-paper", panel=panel, heads="bootstrapped")
         curves = np.stack([r.extra["uncertainty"] for r in e.results(row.cell)]).astype(float)
@@ -163,7 +119,7 @@ def uncertainty(e: Evidence) -> Figure:
 
 def noise(e: Evidence) -> Figure:
     """G11 on the grid: trap visits against rater noise, in both units."""
-    figure, axes = _axes(2, 5.8)
+    figure, axes = axes_of(2, 5.8)
     rng = np.random.default_rng(0)
     agents = ("baseline", "mean of ratings", "uard-paper", "uard")
     for axis, unit in zip(axes, ("reward units", "of the trap's reward"), strict=True):
@@ -184,7 +140,7 @@ def noise(e: Evidence) -> Figure:
 
 def sign_preservation(e: Evidence) -> Figure:
     """G13: the advantage of entering the trap against a reward perturbation, by three definitions."""
-    figure, axes = _axes(3, 4.4, 3.6)
+    figure, axes = axes_of(3, 4.4, 3.6)
     for axis, definition, radius in zip(axes, DEFINITIONS, theory.radii(), strict=True):
         epsilon = np.linspace(0, 10, 200)
         for label, weight, colour in (("raw", 1.0, COLOURS["raw"]), ("filtered", radius.weight, COLOURS["uard-paper"])):
@@ -202,71 +158,9 @@ def learning_curves(e: Evidence) -> Figure:
     return _training(e, "observed_return", agents, "observed return", "6x6")
 
 
-def competition(e: Evidence) -> Figure:
-    """True return of the serious rivals against rater noise, 10x10."""
-    figure, axes = _axes(2, 5.8)
-    noises = list(dict.fromkeys(r["noise"] for r in e.studies["matrix"].rows))
-    for axis, panel in zip(axes, ("main", "appendix"), strict=True):
-        for name in ("mean-of-annotations", "worst-of-annotations", "lcb", "uard-consistent", "uard"):
-            s = [
-                e.get("matrix", "true_return", mitigation=name, size=10, trap=4.0, panel=panel, noise=z) for z in noises
-            ]
-            axis.plot(range(len(noises)), [x.mean for x in s], "o-", color=COLOURS[name], lw=2, label=name)
-            axis.fill_between(
-                range(len(noises)),
-                [x.ci95[0] for x in s],
-                [x.ci95[1] for x in s],
-                color=COLOURS[name],
-                alpha=0.15,
-                lw=0,
-            )
-        axis.set_xticks(range(len(noises)), [f"{z:g}" for z in noises])
-        axis.set(
-            xlabel="sd of rater noise, reward units",
-            ylabel="true return",
-            title=f"10x10, +4, {panel} panel",
-            ylim=(-12, 9),
-        )
-    axes[0].legend(loc="lower left")
-    return figure
-
-
-def budgets(e: Evidence) -> Figure:
-    """True return against the share of steps that are rated, 10x10."""
-    rows: list[Row] = list(e.studies["budgets"].rows)
-    names = list(dict.fromkeys(r["mitigation"] for r in rows))
-    figure, axes = _axes(4, 3.6, 3.8)
-    shown = [(p, z) for p in ("main", "appendix") for z in (0.0, 1.2)]
-    for axis, (panel, level) in zip(axes, shown, strict=True):
-        for name in names:
-            s = [
-                e.get("budgets", "true_return", mitigation=name, panel=panel, noise=level, rated=b)
-                for b in (0.01, 0.1, 1.0)
-            ]
-            base = (
-                name.split(",")[0]
-                .replace("worst-of", "worst-of-annotations")
-                .replace("-annotations-annotations", "-annotations")
-            )
-            axis.plot(
-                range(3),
-                [x.mean for x in s],
-                "o--" if "," in name else "o-",
-                color=COLOURS.get(base, "k"),
-                lw=1.6,
-                ms=4,
-                label=name,
-            )
-        axis.set_xticks(range(3), ["1 %", "10 %", "100 %"])
-        axis.set(xlabel="steps rated", title=f"{panel}, noise {level:g}", ylim=(-14, 9))
-    axes[0].set_ylabel("true return")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
-    return figure
-
-
 def walks(e: Evidence) -> Figure:
     """What the trained agents do: visits per cell of their greedy walk on 10x10."""
-    figure, axes = _axes(3, 4.2, 4.4)
+    figure, axes = axes_of(3, 4.2, 4.4)
     for axis, agent in zip(axes, ("baseline", "uard-paper", "uard"), strict=True):
         cell = e.row("scale", agent=agent, size=10, panel="main").cell
         path = e.results(cell)[0].path
@@ -296,7 +190,7 @@ def adjusted_reward(
     rivals: dict[str, tuple[np.ndarray, str]], ours: np.ndarray, label: str, windows: Sequence[tuple[int, int]]
 ) -> Figure:
     """G14, G15: the confidence-adjusted reward of each rival (steps and colour) and ours, windows shaded."""
-    figure, axes = _axes(len(rivals), 6.2, 3.8)
+    figure, axes = axes_of(len(rivals), 6.2, 3.8)
     for axis, (rival, (values, colour)) in zip(axes, rivals.items(), strict=True):
         _shade(axis, windows)
         axis.plot(values, color=colour, lw=1, label=rival)
@@ -311,7 +205,7 @@ def hacking_region(trace: np.ndarray, windows: Sequence[tuple[int, int]]) -> Fig
 
     The trace's first rows are the observed, the adjusted and Caution's reward, and lambda_t.
     """
-    figure, axes = _axes(2, 6.2, 3.8)
+    figure, axes = axes_of(2, 6.2, 3.8)
     observed, adjusted, caution, lam = trace[:4]
     for axis in axes:
         _shade(axis, windows)

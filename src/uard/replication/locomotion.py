@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from uard.lab import statistics
 from uard.lab.execution import examine
 from uard.lab.study import Row
+from uard.lab.views.figures import axes_of, data_uri
 from uard.lab.views.published import Published, packaged_json
 from uard.lab.views.tables import Table, full, number
 from uard.replication import figures
@@ -515,7 +516,7 @@ def drawn(p: Published) -> list[tuple[str, str, str]]:
             "agent's own action over it, on the learned critics; right: how often its sign is kept. Mean over seeds."
         )
         made.append(("G13 · sign preservation on learned critics, Hopper", note, _signs(p)))
-    return [(title, note, figures.data_uri(figure)) for title, note, figure in made]
+    return [(title, note, data_uri(figure)) for title, note, figure in made]
 
 
 def _traced(p: Published, agent: str) -> np.ndarray:
@@ -524,7 +525,7 @@ def _traced(p: Published, agent: str) -> np.ndarray:
 
 
 def _signs(p: Published) -> Figure:
-    figure, axes = figures._axes(2, 6.2, 3.8)
+    figure, axes = axes_of(2, 6.2, 3.8)
     for agent, style in (("uard", "-"), ("uard (ppo)", "--")):
         (r, *_) = p.rows(DISTORTION, agent=agent)
         mean = p.derived(r, "perturbed").reshape(-1, len(examine.EPSILONS), len(examine.PERTURBED)).mean(0)
@@ -560,7 +561,7 @@ def film() -> list[tuple[str, str, str]]:
 def _dots(p: Published, robot: str) -> Figure:
     there = p.rows(HACKING, robot=robot)
     settings = list(dict.fromkeys((r["agent"], r["region"]) for r in there if r["region"] != "none"))
-    figure, axes = figures._axes(2, 6.2, 1.2 + 0.7 * len(settings))
+    figure, axes = axes_of(2, 6.2, 1.2 + 0.7 * len(settings))
     for axis, metric, label in zip(
         axes, ("trap_visits", "true_return"), ("steps in the region per episode", "true return"), strict=True
     ):

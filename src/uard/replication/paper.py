@@ -1,6 +1,6 @@
 """Every number that the paper prints about its tables, its grids and its figures, typed in once, with its tex line.
 
-Rows are frozen; a ``Stat`` is the paper's "mean +- SD over 10 seeds". Ids (F2, G4, I1, J16...) are those of
+Rows are frozen; a ``Stat`` is the paper's "mean +- SD over 10 seeds". Ids (F2, G4, I1...) are those of
 ``paper/inventory.md``. Nothing is computed here: what follows from these numbers is in ``uard.replication.audit``.
 """
 
@@ -292,60 +292,4 @@ FIGURES = {
         {"UARD below": 0.3, "SUNRISE above": 1.4, "gap": 1.6, "ratio above": 5.0},
     ),
     "G16": Figure(2193, "observed return of all methods against episode; UARD stays low throughout"),
-}
-
-
-class Claim(NamedTuple):
-    """A claim of the paper: the tex line where it is made first or best, and the claim in one sentence."""
-
-    line: int
-    statement: str
-
-
-CLAIMS = {
-    "J1": Claim(404, "Proposition 1: J >= 0 whenever mu >= 0."),
-    "J2": Claim(420, "Proposition 2: J is strictly decreasing in sigma_m and sigma_h for mu > 0."),
-    "J3": Claim(440, "The filter consistently penalises higher uncertainty regardless of the magnitude of mu."),
-    "J4": Claim(396, "The reciprocal form discounts smoothly and does not over-penalise early exploration."),
-    "J5": Claim(478, "Theorem 1: T_lambda is a gamma-contraction in the maximum norm."),
-    "J6": Claim(500, "T_lambda has a unique fixed point, and iteration converges to it from any start."),
-    "J7": Claim(508, "At the fixed point, discounting prevents over-optimisation of misspecified rewards."),
-    "J8": Claim(511, "The filter trades bias for variance, controlled by alpha_m and alpha_h."),
-    "J9": Claim(517, "UARD is a state-action-dependent pessimism akin to CQL."),
-    "J10": Claim(678, "Proposition 3: w is positive, decreasing, bounded by 1, 1 at U = 0 and Lipschitz in U."),
-    "J11": Claim(525, "The reciprocal form emerges naturally from uncertainty-aware utility maximisation."),
-    "J12": Claim(645, "The filter can be read as a Wiener filter and through the Information Bottleneck."),
-    "J13": Claim(868, "The reciprocal filter preserves informative gradients under high uncertainty."),
-    "J14": Claim(840, "Linear subtraction collapses abruptly; exponential decay suppresses too much."),
-    "J15": Claim(39, "UARD needs no ground-truth reward and no change of the environment."),
-    "J16": Claim(51, "UARD reduces hacking by up to 93.6 % across grids and MuJoCo."),
-    "J17": Claim(1149, "Trap visits on 6x6 fall by about 93.7 % against the baseline."),
-    "J18": Claim(944, "Trap hits fall by 87.4 % on 8x8 and by 92.9 % on 10x10."),
-    "J19": Claim(1171, "The alignment gap falls from 77.6 to 3.2, by 95.9 %."),
-    "J20": Claim(1947, "Policy stability improves by 91.7 %."),
-    "J21": Claim(2025, "With 30 % noise the baselines' violations rise by 277 %; UARD's are 98.3 % lower."),
-    "J22": Claim(2132, "UARD has 92.0 % fewer exploit activations than EDAC."),
-    "J23": Claim(2177, "SUNRISE assigns more than five times the reward that UARD deems reliable."),
-    "J24": Claim(49, "UARD is compared with nine baselines."),
-    "J25": Claim(53, "UARD keeps near-zero violations at 10-30 % noise while baselines degrade near-linearly."),
-    "J26": Claim(1143, "After a verification delay UARD turns sharply to the goal around episode 400."),
-    "J27": Claim(1149, "UARD's trap visits are near zero, and its return stable, by about episode 200."),
-    "J28": Claim(940, "UARD works across grid sizes, and baseline exploitation grows with the grid."),
-    "J29": Claim(1220, "UARD's reduction of visits keeps a stable reward performance (1.23)."),
-    "J30": Claim(1943, "UARD keeps competitive convergence and the ability to reach the goal."),
-    "J31": Claim(1257, "Uncertainty estimates without discounting help only marginally (16.2 to 13.5)."),
-    "J32": Claim(1261, "Both sources are needed: UARD-lite 4 visits, human-only 9, full UARD 0."),
-    "J33": Claim(1960, "sigma_m vanishes with training while sigma_h persists and prevents a relapse."),
-    "J34": Claim(1971, "Lambda below 2 hacks occasionally, 5 avoids the trap, above 10 is over-conservative."),
-    "J35": Claim(1084, "All methods share environments, budgets, architectures and the observed reward."),
-    "J36": Claim(1186, "A return of 110 on Walker2d is stable locomotion, and baselines near 350 exploit."),
-    "J37": Claim(1308, "Training costs 2-3 times as much as with a single head."),
-    "J38": Claim(1333, "Abstention under high uncertainty was demonstrated."),
-    "J39": Claim(2055, "lambda_t adapts to the Hacking Region, where static pessimism is not enough."),
-    "J40": Claim(2078, "UARD preserves the sign of the advantage over a wider range of perturbations than PPO."),
-    "J41": Claim(2084, "PPO exhibits the larger sign-preservation radius."),
-    "J42": Claim(216, "UARD is the first to model both uncertainties jointly and to discount adaptively."),
-    "J43": Claim(1318, "Section 5.5 demonstrates robustness to lambda, alpha and beta."),
-    "J44": Claim(2122, "EDAC deviates by more than 0.1, while UARD's adjusted reward stays below 0.3."),
-    "J45": Claim(2028, "At 30 % noise individual baseline seeds exceed 40 violations."),
 }

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
-from uard.envs.grids.trapgrid import PAPER_TRAPS, paper_grid
+from uard.envs.grids.trapgrid import PAPER_TRAPS, TrapGrid, paper_grid
 from uard.envs.tables import Task
 from uard.method import bellman
 from uard.method.stability import DEFINITIONS, Definition, sign_preservation_radius
 from uard.method.weights import reciprocal_weight
-from uard.ratings.panels import ratings
+from uard.ratings.panels import as_panel
 from uard.replication import paper
+
+RATERS = (
+    "1.247 at traps, 0 elsewhere",
+    "panel main",
+    "panel appendix",
+)  # the paper's constants {-1, 2, 1}, and its panels
 
 
 def expected_sigma_h(panel: str, size: int, trap: float, draws: int = 20_000, ddof: int = 0) -> tuple[float, float]:
     """Mean sigma_h of one visit's ratings, at a trap and elsewhere (seeded Monte Carlo)."""
     grid = paper_grid(size, trap)
-    task, truth = grid.task(), grid.truth()
-    said = ratings(panel, task, truth)
+    truth = grid.truth()
+    said = grid.rating_law(as_panel(panel))
     rng = np.random.default_rng(0)
     means = []
     for where in (truth.hack, ~truth.hack):
@@ -42,25 +49,34 @@ class Critical:
 
 @cache
 def critical_lambdas() -> tuple[Critical, ...]:
-    """Every grid, trap reward and kind of rater: the paper's constants {-1, 2, 1}, and both panels as we build them."""
+    """Every grid, trap reward and kind of ``RATERS``."""
     out = []
     for size in PAPER_TRAPS:
         for trap in (4.0, 8.0):
             grid = paper_grid(size, trap)
             task, hack = grid.task(), grid.truth().hack
-            kinds = {"1.247 at traps, 0 elsewhere": (paper.SIGMA_H_AT_TRAP, 0.0)}
-            kinds |= {f"panel {p}": expected_sigma_h(p, size, trap) for p in ("main", "appendix")}
-            for name, (at_trap, elsewhere) in kinds.items():
+            panels = (expected_sigma_h(p, size, trap) for p in ("main", "appendix"))
+            kinds = ((paper.SIGMA_H_AT_TRAP, 0.0), *panels)
+            for name, (at_trap, elsewhere) in zip(RATERS, kinds, strict=True):
                 sigma = np.where(hack, at_trap, elsewhere)
                 out.append(Critical(size, trap, name, bellman.critical_lambda(task, hack, sigma)))
     return tuple(out)
 
 
+def weight_at_trap() -> float:
+    """Return the filter's weight where sigma_h is the paper's 1.247 and the heads agree."""
+    return float(reciprocal_weight(paper.BETA * paper.SIGMA_H_AT_TRAP, paper.LAMBDA))
+
+
+def _sigma_h(grid: TrapGrid) -> np.ndarray:
+    """Return what the main panel's raters are expected to disagree by, (S, A)."""
+    at_trap, elsewhere = expected_sigma_h("main", grid.size, 4.0)
+    return np.where(grid.truth().hack, at_trap, elsewhere)
+
+
 def _frozen(size: int) -> tuple[Task, np.ndarray]:
     grid = paper_grid(size)
-    at_trap, elsewhere = expected_sigma_h("main", size, 4.0)
-    u = paper.BETA * np.where(grid.truth().hack, at_trap, elsewhere)
-    return grid.task(), np.asarray(reciprocal_weight(u, paper.LAMBDA))
+    return grid.task(), np.asarray(reciprocal_weight(paper.BETA * _sigma_h(grid), paper.LAMBDA))
 
 
 @cache
@@ -96,6 +112,60 @@ def fixed_point_spread(starts: int = 20) -> float:
         for _ in range(starts)
     ]
     return float(np.ptp(np.stack(points), axis=0).max())
+
+
+@cache
+def live_fixed_point_spread(starts: int = 20, iterations: int = 600) -> float:
+    """Largest difference between what the ensemble map with live weights reaches from random starts, 6x6.
+
+    The map is no contraction, but all heads are given the same reward: their gaps shrink by gamma a step, sigma_m
+    vanishes, and what is left is the map with weights frozen at sigma_h.
+
+    Args:
+        starts: Number of random ensembles, values of standard deviation 100.
+        iterations: Of the map; 600 leave gamma^600 = 4e-14 of a gap.
+    """
+    grid = paper_grid(6)
+    task, sigma_h = grid.task(), _sigma_h(grid)
+    rng = np.random.default_rng(0)
+    reached = []
+    for _ in range(starts):
+        heads = rng.normal(0, 100, (*task.reward.shape, paper.HEADS))
+        for _ in range(iterations):
+            heads = bellman.ensemble_backup(heads, task.reward, task.next_state, task.terminal, paper.GAMMA, sigma_h)
+        reached.append(heads)
+    return float(np.ptp(np.concatenate(reached, axis=-1), axis=-1).max())
+
+
+class Bias(NamedTuple):
+    """How far fixed points on 6x6 are from Q*, the optimal values of the true reward (maximum norm).
+
+    Attributes:
+        honest: Of the filtered true reward.
+        filtered: Of the filtered reward with its trap.
+        raw: Of the reward with its trap, unfiltered.
+    """
+
+    honest: float
+    filtered: float
+    raw: float
+
+
+@cache
+def bias() -> Bias:
+    """Return how far the filter, and the trap, move the fixed point off Q*, main panel."""
+    grid = paper_grid(6)
+    task, w = _frozen(6)
+
+    def values(reward: np.ndarray, weight: np.ndarray | float) -> np.ndarray:
+        return bellman.solve(reward, weight, task.next_state, task.terminal, paper.GAMMA)
+
+    true = np.asarray(grid.truth().reward)
+    best = values(true, 1.0)
+    honest, filtered, raw = (
+        float(np.abs(q - best).max()) for q in (values(true, w), values(task.reward, w), values(task.reward, 1.0))
+    )
+    return Bias(honest, filtered, raw)
 
 
 @dataclass(frozen=True)
@@ -153,7 +223,7 @@ def radii() -> tuple[Radius, ...]:
     q = bellman.solve(task.reward, 1.0, task.next_state, task.terminal, paper.GAMMA)
     s, a = (int(i) for i in np.argwhere(hack)[0])
     advantage = float(q[s, a] - np.delete(q[s], a).max())
-    w = float(reciprocal_weight(paper.BETA * paper.SIGMA_H_AT_TRAP, paper.LAMBDA))
+    w = weight_at_trap()
     return tuple(
         Radius(
             d,

@@ -9,8 +9,9 @@ Words are data (TOML), numbers come from results, and each part is one expressio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 VERDICTS = HOLDS, IN_PART, FAILS, UNTESTABLE = "holds", "holds in part", "does not hold", "cannot be tested"
@@ -37,11 +38,26 @@ class Opinion:
 
     Attributes:
         name: What the text would have to say.
-        holds: Our reading.
+        holds: Our reading; None where neither the text nor any number of ours can answer it.
     """
 
     name: str
-    holds: bool
+    holds: bool | None
+
+
+def each(name: str, settings: Iterable[str], holds: Callable[[Numbers, str], bool | None]) -> tuple[Part, ...]:
+    """Return one part per setting of a claim that is made of several: a grid, a panel, an agent.
+
+    Args:
+        name: What must hold, ``{}`` standing for the setting.
+        settings: Their names, as the claim's numbers are keyed by.
+        holds: One expression of the numbers and of the setting's name.
+    """
+    return tuple(Part(name.format(s), partial(_in_setting, holds, s)) for s in settings)
+
+
+def _in_setting(holds: Callable[[Numbers, str], bool | None], setting: str, numbers: Numbers) -> bool | None:
+    return holds(numbers, setting)
 
 
 @dataclass(frozen=True)

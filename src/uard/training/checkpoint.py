@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+
+from uard._support import files
 
 VERSION = 1
 
@@ -41,16 +42,9 @@ def save(path: Path, config: str, state: Any) -> None:
     data = body.getvalue()
     head = f"uard checkpoint {VERSION}\n{config}\n{hashlib.sha256(data).hexdigest()}\n".encode()
     path.parent.mkdir(parents=True, exist_ok=True)
-    half = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        with half.open("wb") as file:
-            file.write(head)
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        half.replace(path)
-    finally:
-        half.unlink(missing_ok=True)
+    with files.replacing(path) as file:
+        file.write(head)
+        file.write(data)
 
 
 def load(path: Path, config: str, like: Any) -> Any:

@@ -1,28 +1,66 @@
-"""The paper's experiments, and ours, as data."""
+"""Experiments as data: ours, and those that installed packages bring (``uard.plugins``), the paper's among them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import cache
+
 from uard import _checks
-from uard.lab.studies import grids as ours
+from uard.lab.studies import games, grids
 from uard.lab.studies import plugins as own
 from uard.lab.study import Study
-from uard.replication.studies import deep, locomotion
-from uard.replication.studies import grids as paper
+from uard.plugins import Plugin, PluginError, brought
+
+
+def groups() -> dict[str, tuple[Study, ...]]:
+    """Return the studies by the name under which they are run together; groups of one name are joined."""
+    return _joined()[0]
+
+
+def broken() -> list[PluginError]:
+    """Return an error for each package's studies that cannot be used; nothing that its entry point brings is."""
+    return _joined()[1]
+
+
+def _joined() -> tuple[dict[str, tuple[Study, ...]], list[PluginError]]:
+    joined = {**_ours(), **({"plugins": crossed} if (crossed := own.brought()) else {})}
+    studies = {s.name for group in joined.values() for s in group}
+
+    def join(plugin: Plugin) -> None:
+        theirs = _called(plugin)
+        new = [s.name for group in theirs.values() for s in group]
+        for name in new:
+            if name in studies or name in joined or name in theirs or new.count(name) > 1:
+                raise PluginError(plugin, f"the name of its study {name!r} is taken")
+        for name in theirs:
+            if name in studies:
+                raise PluginError(plugin, f"the name of its group {name!r} is that of a study")
+        studies.update(new)
+        joined.update({name: joined.get(name, ()) + group for name, group in theirs.items()})
+
+    return joined, brought("studies", join)[1]
+
+
+@cache
+def _ours() -> dict[str, tuple[Study, ...]]:
+    return {"grid": grids.studies(), "games": games.studies()}
+
+
+@cache
+def _called(plugin: Plugin) -> dict[str, tuple[Study, ...]]:
+    made = plugin.call()
+    good = isinstance(made, Mapping) and all(
+        isinstance(name, str) and isinstance(group, tuple) and all(isinstance(s, Study) for s in group)
+        for name, group in made.items()
+    )
+    if not good:
+        raise PluginError(plugin, f"{_checks.short(made)} is no dictionary of groups, (Study, ...) by name")
+    return dict(made)
 
 
 def grid() -> tuple[Study, ...]:
     """Return all studies of the tabular grids: what ``uard reproduce`` runs."""
-    return (*paper.studies(), *ours.studies())
-
-
-def groups() -> dict[str, tuple[Study, ...]]:
-    """Return the studies by the name under which they are run together."""
-    sizes = {
-        f"mujoco-{scale.name}": locomotion.studies(scale)
-        for scale in (locomotion.SMOKE, locomotion.STANDARD, locomotion.PAPER)
-    }
-    ours_and_theirs = {"grid": grid(), "grid-deep": deep.studies(), "games": deep.others(), **sizes}
-    return ours_and_theirs | ({"plugins": brought} if (brought := own.brought()) else {})
+    return groups()["grid"]
 
 
 def every() -> tuple[Study, ...]:

@@ -27,7 +27,8 @@ import numpy as np
 
 from uard import _checks
 from uard.lab.statistics import summarise
-from uard.method.mitigations import Evidence, Feedback, Mitigation, named
+from uard.method.mitigations import Evidence, Mitigation, named
+from uard.ratings.aggregate import aggregate
 
 PANELS = ("independent", "contested", "colluding")
 LARGEST = 10_000
@@ -202,10 +203,10 @@ def filtered(scores: np.ndarray, mitigation: Mitigation) -> np.ndarray:
     The scores are the ratings and their mean is the observed reward. Every answer is rated once by all models, so a
     mitigation that has a pseudo-count should have it at 0.
     """
-    reward, one = scores.mean(1), np.ones(len(scores))
-    feedback = Feedback(one, reward, scores.min(1), scores.std(1), reward, scores.shape[1] * one)
-    usual = mitigation.usual(feedback, np.ones(len(scores), bool))
-    return np.asarray(mitigation.signal(Evidence(reward, 0.0 * one, feedback), usual).reward)
+    reward = scores.mean(1)
+    feedback = aggregate(scores, reward)
+    statistics = mitigation.fit(feedback, np.ones(len(scores), bool))
+    return np.asarray(mitigation.signal(Evidence(reward, np.zeros(len(scores)), feedback), statistics).reward)
 
 
 def _uard(scores: np.ndarray) -> np.ndarray:

@@ -8,9 +8,10 @@ from uard.agents.tabular import QLearning
 from uard.envs.grids.learned_reward import LearnedRewardGrid
 from uard.envs.grids.trapgrid import TrapGrid, paper_grid
 from uard.lab.cell import Cell
+from uard.lab.studies.common import PANELS, RAW, SIZES, WALKER
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import Mitigation, named
-from uard.replication.studies.grids import PANELS, RAW, SIZES, WALKER
+from uard.ratings.panels import as_panel
 
 COMPARED = (
     "raw",
@@ -31,7 +32,7 @@ def matrix() -> tuple[Row, ...]:
     """Every mitigation on every grid, trap reward, panel and noise."""
     return tuple(
         row(
-            Cell(paper_grid(size, trap), named(name), panel=panel, noise=noise),
+            Cell(paper_grid(size, trap), named(name), panel=as_panel(panel), noise=noise),
             mitigation=name,
             size=size,
             trap=trap,
@@ -50,7 +51,7 @@ def legitimate() -> tuple[Row, ...]:
     """Twins in which the bonus is real and the raters say so: what does caution cost?"""
     return tuple(
         row(
-            Cell(paper_grid(size, trap, legitimate=True), named(name), panel=panel),
+            Cell(paper_grid(size, trap, legitimate=True), named(name), panel=as_panel(panel)),
             mitigation=name,
             size=size,
             trap=trap,
@@ -80,7 +81,7 @@ def budgets() -> tuple[Row, ...]:
     }
     return tuple(
         row(
-            Cell(paper_grid(10), make(), panel=panel, noise=noise, rated=rated),
+            Cell(paper_grid(10), make(), panel=as_panel(panel), noise=noise, rated=rated),
             mitigation=name,
             panel=panel,
             noise=noise,
@@ -110,7 +111,7 @@ def unseen() -> tuple[Row, ...]:
     """Grids that no setting was chosen on, the last two of them the 10x10 with all rewards scaled."""
     return tuple(
         row(
-            Cell(grid, named(name), QLearning(init_scale=grid.goal_reward / 100), panel),
+            Cell(grid, named(name), QLearning(init_scale=grid.goal_reward / 100), as_panel(panel)),
             mitigation=name,
             grid=f"{grid.size}x{grid.size}, {len(grid.traps or ())} traps of {grid.trap_reward:g}, T={grid.horizon}"
             + (f", goal {grid.goal_reward:g}" if grid.goal_reward != 10 else ""),
@@ -147,7 +148,7 @@ def settings() -> tuple[Row, ...]:
     }
     return tuple(
         row(
-            Cell(paper_grid(10, trap), named("uard", **changes), panel=panel, noise=noise),
+            Cell(paper_grid(10, trap), named("uard", **changes), panel=as_panel(panel), noise=noise),
             variant=name,
             trap=trap,
             panel=panel,

@@ -12,11 +12,11 @@ from uard.envs.grids.trapgrid import paper_grid
 from uard.envs.locomotion.physics import Locomotion
 from uard.lab import registry as names
 from uard.lab.cell import Cell
+from uard.lab.studies.common import LOCOMOTION_STEPS, PANELS
 from uard.lab.studies.grids import COMPARED
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import named
-from uard.replication.studies.grids import PANELS
-from uard.replication.studies.locomotion import STANDARD
+from uard.ratings.panels import as_panel
 from uard.training.feedback.rating_model import RatingModel
 
 AGENTS = ("q-learning", "ensemble-dqn", "ppo")  # the first that can work in an environment learns there
@@ -62,11 +62,11 @@ def agents() -> tuple[Row, ...]:
 
 def _crossed(where: str, environment: Any, name: str, agent: Any, panels: tuple[str, ...]) -> list[Row]:
     physical = isinstance(environment, Locomotion)
-    feedback = None if physical or isinstance(agent, QLearning) else RatingModel()
-    steps = STANDARD.steps if physical else None
+    rating_model = None if physical or isinstance(agent, QLearning) else RatingModel()
+    steps = LOCOMOTION_STEPS if physical else None
     return [
         row(
-            Cell(environment, named(mitigation), agent, panel, feedback=feedback, steps=steps),
+            Cell(environment, named(mitigation), agent, as_panel(panel), rating_model=rating_model, steps=steps),
             environment=where,
             agent=name,
             mitigation=mitigation,

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from uard.lab.views.figures import axes_of
 from uard.lab.views.tables import Table
-from uard.replication import figures
 
 SHOWN = (10, 100, 1000, 10_000)
 COLOURS = {
@@ -72,7 +72,7 @@ def table(data: Mapping[str, Any]) -> Table:
 def figure(data: Mapping[str, Any]) -> Figure:
     """Draw gold (lines) and proxy (dotted) against KL for every panel; the band is the interval of ``uard``."""
     panels = list(dict.fromkeys(c["panel"] for c in data["curves"]))
-    drawn, axes = figures._axes(len(panels), 4.4, 4.0)
+    drawn, axes = axes_of(len(panels), 4.4, 4.0)
     for axis, panel in zip(axes, panels, strict=True):
         for c in data["curves"]:
             if c["panel"] != panel:

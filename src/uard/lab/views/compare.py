@@ -21,6 +21,7 @@ from uard import _checks
 from uard.lab.execution.store import Store
 from uard.lab.result import Result, digest
 from uard.lab.statistics import hedges_g
+from uard.lab.views.leaderboard import panel_name
 
 LEVEL = 0.05
 EXACT = 12  # seeds up to which every swap is tried
@@ -254,7 +255,9 @@ def _named(data: Any) -> Any:
 def title(config: dict[str, Any]) -> str:
     """Return what a cell is about, for one that is in no study."""
     names = [config[part]["class"].rpartition(".")[2] for part in ("environment", "mitigation", "agent")]
-    return ", ".join([*names, f"panel {config['panel']}", f"{config.get('steps') or config['episodes']} long"])
+    return ", ".join(
+        [*names, f"panel {panel_name(config['panel'])}", f"{config.get('steps') or config['episodes']} long"]
+    )
 
 
 def lines(comparison: Comparison) -> list[str]:

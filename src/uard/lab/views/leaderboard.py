@@ -15,12 +15,15 @@ from typing import Any
 import numpy as np
 
 from uard import InvalidValueError, __version__
+from uard._support import files
 from uard.lab import registry as names
 from uard.lab import statistics
 from uard.lab.cell import plain
 from uard.lab.execution.store import Store
 from uard.lab.views.tables import number
+from uard.lab.views.templates import HERE, render
 from uard.method.mitigations import NAMED, named
+from uard.ratings.panels import PANELS
 
 RAW = "raw"
 HONEST, COLLUDING, TWIN = "honest raters", "colluding raters", "legitimate twin"
@@ -177,16 +180,15 @@ def write(target: Path, store: Store) -> Path:
     Raises:
         InvalidValueError: the store is empty, or the file cannot be written.
     """
-    import jinja2
-
     these = lines(store)
     if not these:
         raise InvalidValueError("store", store.path, "one with finished cells")
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    environment.globals.update(number=number, share=share)
     every = standings(these)
-    page = environment.get_template("leaderboard.html.j2").render(
+    page = render(
+        HERE,
+        "leaderboard.html.j2",
+        number=number,
+        share=share,
         version=__version__,
         named=[s for s in every if ", " not in s.mitigation],
         varied=[s for s in every if ", " in s.mitigation],
@@ -198,11 +200,7 @@ def write(target: Path, store: Store) -> Path:
         seeds=sum(x.seeds for x in these),
         cells=len(these),
     )
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise InvalidValueError("out", str(target), f"a file that can be written ({error})") from None
+    files.write(target, page, "out")
     return target
 
 
@@ -220,26 +218,33 @@ def _line(
     config: dict[str, Any], known: _Names, seeds: int, failed: int, hacks: Estimate | None, true: Estimate | None
 ) -> Line:
     mitigation = known.of("mitigation", config["mitigation"])
-    twin = config["environment"].get("legitimate", False)
+    panel, twin = panel_name(config["panel"]), config["environment"].get("legitimate", False)
     trained = [f"{config['steps']:,} steps" if "steps" in config else f"{config['episodes']:,} episodes"]
     tabular = "heads" in config["agent"]
     if "steps" not in config and not tabular:
-        trained.append("learned ratings" if "feedback" in config else "running means")
+        trained.append("learned ratings" if "rating_model" in config else "running means")
     trained += [f"{name} {config[name]}" for name in ("ddof", "snapshots") if config[name]]
     return Line(
         known.of("environment", config["environment"]),
         known.of("agent", config["agent"]),
         mitigation,
-        "–" if mitigation == RAW else config["panel"],
+        "–" if mitigation == RAW else panel,
         config["noise"],
         config["rated"],
         ", ".join(trained),
-        TWIN if twin else COLLUDING if config["panel"] == "colluding" else HONEST,
+        TWIN if twin else COLLUDING if panel == "colluding" else HONEST,
         seeds,
         failed,
         hacks,
         true,
     )
+
+
+def panel_name(config: Any) -> str:
+    """Return what the panel of a stored configuration is called; ``of its own`` if it has no name."""
+    if isinstance(config, str):
+        return config
+    return next((name for name, panel in PANELS.items() if plain(panel) == config), "of its own")
 
 
 class _Names:

@@ -13,48 +13,53 @@ import os
 import platform
 import shutil
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib import metadata, resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from uard import __version__
-from uard.envs.base import Tables
+from uard import __version__, _checks
 from uard.lab import statistics
 from uard.lab.cell import RESULTS, Cell
-from uard.lab.execution import examine
 from uard.lab.execution.store import Store
-from uard.lab.result import TABLES, Result
+from uard.lab.result import Result
 from uard.lab.statistics import Summary
 from uard.lab.study import Row, Study
-from uard.method import calibration
-from uard.replication import distortion
+from uard.plugins import Plugin, PluginError, brought
 
+KEPT = ("calibration", "rating_error")  # of what a result holds beside its curves, as it is
 BIN = 10  # episodes
-CURVES = ("observed_return", "trap_visits", "goal")
-FILES = (
-    "grid-deep.json",
-    "games.json",
-    "mujoco-one.json",
-    "mujoco-eight.json",
-    "mujoco.json",  # of as many seeds as their names say, the last of three
-)
+
+
+@dataclass(frozen=True)
+class ResultFiles:
+    """Published results of one package (what an entry point of ``uard.results`` returns).
+
+    Attributes:
+        folder: Holds JSON files (``packaged_json``).
+        studies: Names of those that ``uard reproduce --extract`` wrote; of a cell in several of them the last is taken.
+    """
+
+    folder: Traversable
+    studies: tuple[str, ...]
 
 
 def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], command: str) -> dict[str, Any]:
     """Gather what the report needs of some studies as plain data; a row counts when all its seeds are finished."""
-    wanted: dict[Cell, set[str]] = {}
+    wanted: dict[Cell, dict[str, Study]] = {}
     for study in studies:
         for r in study.rows:
-            wanted.setdefault(r.cell, set()).add(study.name)
+            wanted.setdefault(r.cell, {})[study.name] = study
     cells: dict[str, Any] = {}
-    for cell, names in wanted.items():
+    for cell, theirs in wanted.items():
         found = store.get(cell, seeds)
         if len(found) == len(seeds):
-            cells[cell.key] = _of_cell(names, cell, found)
+            cells[cell.key] = _of_cell(theirs.values(), cell, found)
     packages = ["jax", "numpy", "optax"] + (["mujoco"] if any(cell.steps for cell in wanted) else [])
     return {
         "command": command,
@@ -79,66 +84,37 @@ def checkout() -> str | None:
     return git("describe", "--always", "--dirty", "--abbrev=12", "--exclude=*").stdout.strip()
 
 
-def _of_cell(studies: set[str], cell: Cell, found: dict[int, Result]) -> dict[str, Any]:
-    results = [found[s] for s in sorted(found)]
+def _of_cell(studies: Iterable[Study], cell: Cell, found: Mapping[int, Result]) -> dict[str, Any]:
+    found = {seed: found[seed] for seed in sorted(found)}
+    results = list(found.values())
     metrics = [r.metrics() for r in results]
     out: dict[str, Any] = {
         "config": cell.config(),
-        "seeds": sorted(found),
-        "metrics": {m: [_short(x[m]) for x in metrics] for m in metrics[0]},
+        "seeds": list(found),
+        "metrics": {m: _short([x[m] for x in metrics]) for m in metrics[0]},
     }
-    if "deep-baselines" in studies:
-        out["curves"] = {c: [[_short(x) for x in _binned(r.curve(c))] for r in results] for c in CURVES}
-    derived: dict[str, list[Any]] = {}
-    for name in ("calibration", "rating_error"):
-        if name in results[0].extra:
-            derived[name] = [[_short(x) for x in r.extra[name]] for r in results]
-    if "deep-ensembles" in studies:
-        derived["sigma_m"] = [[_short(x) for x in sigma_quality(cell, r)] for r in results]
-    if "evaluation" in results[0].extra:  # columns of training.lanes.LOG
-        means = [r.extra["evaluation"].mean(0) for r in results]
-        derived["deterministic"] = [[_short(m[0]), _short(m[1])] for m in means]  # hacks, true return
-    if "deep-distortion" in studies:
-        traces = [distortion.walk(cell, r, s) for s, r in sorted(found.items())]
-        derived["activations"] = [distortion.activations(t) for t in traces]
-        derived["largest"] = [_short(t.adjusted[t.counts].max()) for t in traces]
-        derived["mean_inside"] = [_short(t.adjusted[t.counts].mean()) for t in traces]
-        derived["trace"] = [[_short(x) for x in column] for column in traces[0][:4]]
-    if "mujoco-standard-distortion" in studies:
-        for name in ("perturbed", "warning"):
-            derived[name] = [[_short(x) for x in r.extra[name].ravel()] for r in results]
-        derived["reaction"] = [[_short(x) for x in examine.reaction(r.extra["trace"])] for r in results]
-        derived["trace"] = [[_short(x) for x in column] for column in results[0].extra["trace"].T]
-    return out | ({"derived": derived} if derived else {})
+    if columns := {c: None for study in studies for c in study.curves}:
+        out["curves"] = {c: _short([_binned(r.curve(c)) for r in results]) for c in columns}
+    derived: dict[str, Any] = {n: [r.extra[n] for r in results] for n in KEPT if n in results[0].extra}
+    if "evaluation" in results[0].extra:  # columns of training.episode_log.LOG
+        derived["deterministic"] = [r.extra["evaluation"].mean(0)[:2] for r in results]  # hacks, true return
+    for study in studies:
+        derived |= study.derive(cell, found) if study.derive else {}
+    return out | ({"derived": _short(derived)} if derived else {})
 
 
-def _short(x: Any) -> float:
-    return float(f"{float(x):.6g}")
+def _short(x: Any) -> Any:
+    """Return numbers, however nested, as JSON has them, with six significant digits."""
+    if isinstance(x, Mapping):
+        return {name: _short(value) for name, value in x.items()}
+    if isinstance(x, list | tuple | np.ndarray):
+        return [_short(value) for value in x]
+    return int(x) if isinstance(x, int | np.integer) else float(f"{float(x):.6g}")
 
 
 def _binned(curve: np.ndarray) -> np.ndarray:
     whole = len(curve) // BIN * BIN
     return curve[:whole].reshape(-1, BIN).mean(1)
-
-
-SIGMA_QUALITY = ("auroc_unseen", "spearman_error")
-
-
-def sigma_quality(cell: Cell, result: Result) -> tuple[float, float]:
-    """How good is sigma_m? AUROC of it for state-actions never tried, and its rank correlation with |mu - Q*|.
-
-    Q* is exact for the observed reward. Needs an agent all of whose steps were rated, so that tried means rated.
-    """
-    from uard.method import bellman
-
-    assert isinstance(cell.environment, Tables)
-    held = {name: result.extra["tables"][..., i].astype(float) for i, name in enumerate(TABLES)}
-    tried = held["rated"] > 0
-    task = cell.environment.task()
-    exact = bellman.solve(task.reward, 1.0, task.next_state, task.terminal, cell.agent.gamma)  # type: ignore[attr-defined]
-    both = bool(tried.any() and not tried.all())
-    unseen = calibration.auroc(held["sigma_m"].ravel(), ~tried.ravel()) if both else 0.5
-    return unseen, calibration.spearman(held["sigma_m"].ravel(), np.abs(held["mu"] - exact).ravel())
 
 
 class Published:
@@ -208,14 +184,38 @@ class Published:
 
 
 def packaged_json(name: str) -> Any:
-    """Return a packaged file's numbers, or None if there is none."""
-    file = resources.files("uard.replication") / "results" / name
-    return json.loads(file.read_text()) if file.is_file() else None
+    """Return a packaged file's numbers, ours or a package's, or None if there is none."""
+    for place in _places():
+        if (file := place.folder / name).is_file():
+            return json.loads(file.read_text(encoding="utf-8"))
+    return None
 
 
 @cache
 def packaged() -> Published:
-    """Return what is published with this version."""
+    """Return what is published with this version and the installed packages."""
     from uard.lab.studies import every
 
-    return Published(every(), [data for name in FILES if (data := packaged_json(name))])
+    files = [place.folder / name for place in _places() for name in place.studies]
+    return Published(every(), [json.loads(file.read_text(encoding="utf-8")) for file in files])
+
+
+def broken() -> list[PluginError]:
+    """Return an error for each package's published results that cannot be used."""
+    return brought("results", _called)[1]
+
+
+def _places() -> list[ResultFiles]:
+    return [
+        ResultFiles(resources.files("uard.lab.published"), ("games.json",)),
+        *brought("results", _called)[0].values(),
+    ]
+
+
+def _called(plugin: Plugin) -> ResultFiles:
+    made = plugin.call()
+    if not isinstance(made, ResultFiles):
+        raise PluginError(plugin, f"{_checks.short(made)} is no ResultFiles")
+    if lost := [name for name in made.studies if not (made.folder / name).is_file()]:
+        raise PluginError(plugin, f"there is no file {', '.join(lost)} in {made.folder}")
+    return made

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from uard.lab.statistics import Summary
 from uard.lab.study import Study
 from uard.lab.views.evidence import Evidence
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
 SHOWN = ("trap_visits", "goal_rate", "true_return", "observed_return", "alignment_gap")
-PLAIN = 500  # rows from which on a terminal gets plain columns: rich needs a second for a thousand rows
 
 
 @dataclass(frozen=True)
@@ -25,30 +20,6 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     labels: int = 1
     note: str = ""
-
-    def to_rich(self, console: Console) -> None:
-        """Print it."""
-        if len(self.rows) > PLAIN:
-            console.out(self._plain(), highlight=False)
-            return
-        from rich.table import Table as RichTable
-
-        table = RichTable(title=self.title, title_justify="left")
-        for i, column in enumerate(self.columns):
-            table.add_column(column, justify="left" if i < self.labels else "right")
-        for r in self.rows:
-            table.add_row(*r)
-        console.print(table)
-
-    def _plain(self) -> str:
-        widths = [max(map(len, column)) for column in zip(self.columns, *self.rows, strict=True)]
-        lines = (
-            "  ".join(
-                x.ljust(w) if i < self.labels else x.rjust(w) for i, (x, w) in enumerate(zip(r, widths, strict=True))
-            )
-            for r in (self.columns, *self.rows)
-        )
-        return "\n".join([self.title, *(line.rstrip() for line in lines)])
 
 
 def number(x: float) -> str:

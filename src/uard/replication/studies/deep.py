@@ -5,24 +5,26 @@ from __future__ import annotations
 from uard.agents.networks import Ensemble
 from uard.agents.tabular import QLearning
 from uard.agents.value import DeepQ
-from uard.envs.grids.gaming import AbsentSupervisor, BoatRace, TomatoWatering
 from uard.envs.grids.trapgrid import TrapGrid, paper_grid
 from uard.lab.cell import Cell
-from uard.lab.registry import can_work, deep_agents
+from uard.lab.registry import deep_agents
+from uard.lab.studies.common import PANELS, RAW
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import Mitigation, named
-from uard.replication.studies.grids import PANELS, RAW
+from uard.ratings.panels import as_panel
+from uard.replication.studies import derive
 from uard.training.feedback.rating_model import RatingModel
 
 AGENTS = deep_agents()
 ENSEMBLE = AGENTS["ensemble-dqn"]
 LEARNED = RatingModel()
+CURVES = ("observed_return", "trap_visits", "goal")
 
 
 def cell(environment: object, mitigation: Mitigation, agent: object, **more: object) -> Cell:
     """Build a cell whose agent learns what raters would say."""
-    feedback = None if isinstance(agent, QLearning) else LEARNED
-    return Cell(environment, mitigation, agent, **({"feedback": feedback} | more))  # type: ignore[arg-type]
+    rating_model = None if isinstance(agent, QLearning) else LEARNED
+    return Cell(environment, mitigation, agent, **({"rating_model": rating_model} | more))  # type: ignore[arg-type]
 
 
 def baselines() -> tuple[Row, ...]:
@@ -54,7 +56,7 @@ def mitigated() -> tuple[Row, ...]:
     """``uard`` with one setting, T = 100: three agents with +4 and +8 and both panels, the others with one of each."""
     return tuple(
         row(
-            cell(TrapGrid(size=10, trap_reward=trap, horizon=100), named("uard"), agent, panel=panel),
+            cell(TrapGrid(size=10, trap_reward=trap, horizon=100), named("uard"), agent, panel=as_panel(panel)),
             agent=name,
             trap=trap,
             panel=panel,
@@ -74,7 +76,7 @@ def rivals() -> tuple[Row, ...]:
     """The other mitigations in the hands of two deep agents, very noisy raters, T = 80."""
     return tuple(
         row(
-            cell(paper_grid(10), named(mitigation), AGENTS[agent], panel=panel, noise=1.2),
+            cell(paper_grid(10), named(mitigation), AGENTS[agent], panel=as_panel(panel), noise=1.2),
             agent=agent,
             mitigation=mitigation,
             panel=panel,
@@ -117,7 +119,7 @@ def feedback() -> tuple[Row, ...]:
     """Running means or a model of the ratings, when 1 %, 10 % or all steps are rated."""
     return tuple(
         row(
-            cell(paper_grid(10), named("uard"), ENSEMBLE, rated=rated, feedback=model),
+            cell(paper_grid(10), named("uard"), ENSEMBLE, rated=rated, rating_model=model),
             source=source,
             rated=rated,
         )
@@ -136,65 +138,21 @@ def distortion() -> tuple[Row, ...]:
     )
 
 
-GAMES = {
-    f"{type(game).__name__}{' (legitimate)' if game.legitimate else ''}": game
-    for legitimate in (False, True)
-    for game in (
-        BoatRace(legitimate=legitimate),
-        TomatoWatering(factor=0.1, legitimate=legitimate),
-        AbsentSupervisor(legitimate=legitimate),
-    )
-}
-GAMING_EPISODES = 100
-
-
-def gaming() -> tuple[Row, ...]:
-    """The reward-gaming gridworlds and their legitimate twins: every agent with every mitigation.
-
-    100 episodes. Tomatoes pay 0.1 each, not the published 0.02, so that the raters' noise (sd 0.1 and more) does not
-    drown them.
-    """
-    agents = {"q-learning": QLearning(), **AGENTS}
-    return tuple(
-        row(
-            cell(game, named(mitigation), agent, episodes=GAMING_EPISODES),
-            game=where,
-            agent=name,
-            mitigation=mitigation,
-        )
-        for where, game in GAMES.items()
-        for name, agent in agents.items()
-        if can_work(agent, game)
-        for mitigation in (
-            "raw",
-            "worst-of-annotations",
-            "lcb",
-            "screening",
-            "mean-of-annotations",
-            "uard-paper",
-            "uard",
-        )
-    )
-
-
 def studies() -> tuple[Study, ...]:
     """Return what ``uard reproduce grid-deep`` runs."""
     return (
-        Study("deep-baselines", "All agents on the raw reward of 10x10", "H3, H17, F3, G16", baselines()),
+        Study("deep-baselines", "All agents on the raw reward of 10x10", "H3, H17, F3, G16", baselines(), CURVES),
         Study("deep-competence", "All agents on the true reward of 10x10", "J35, control", competence()),
         Study("deep-uard", "All agents with uard on 10x10", "H3, J15", mitigated()),
         Study("deep-rivals", "Other mitigations in deep agents", "honest competition", rivals()),
         Study("deep-ablation", "Which component does the work, deep", "H8, F5", ablation()),
-        Study("deep-ensembles", "Kinds of ensembles", "K4, K9", ensembles()),
+        Study("deep-ensembles", "Kinds of ensembles", "K4, K9", ensembles(), derive=derive.sigma_m),
         Study("deep-feedback", "A table or a model of the ratings", "A18", feedback()),
-        Study("deep-distortion", "A distorted reward after training", "H13, H15, H16, G12, G14, G15", distortion()),
-    )
-
-
-def others() -> tuple[Study, ...]:
-    """Return those that are run on their own."""
-    return (
         Study(
-            "gaming", "Reward-gaming gridworlds, every agent and mitigation", "DESIGN: where the hacks are", gaming()
+            "deep-distortion",
+            "A distorted reward after training",
+            "H13, H15, H16, G12, G14, G15",
+            distortion(),
+            derive=derive.distorted,
         ),
     )

@@ -8,16 +8,14 @@ from __future__ import annotations
 from uard.agents.tabular import QLearning
 from uard.envs.grids.trapgrid import paper_grid
 from uard.lab.cell import Cell
+from uard.lab.studies.common import PANELS, RAW, SIZES, WALKER
 from uard.lab.study import Row, Study, row
 from uard.method.abstention import Abstention
 from uard.method.mitigations import Mitigation, named
+from uard.ratings.panels import as_panel
 
-SIZES = (6, 8, 10)
-PANELS = ("main", "appendix")
 SINGLE = QLearning(heads=1)
 BOOTSTRAPPED = QLearning(bootstrap=0.5)
-WALKER = QLearning(heads=1, epsilon=1.0, epsilon_decay=1.0, epsilon_min=1.0)
-RAW = named("raw")
 
 # The agents that most tables compare: (label, agent, mitigation).
 HEADLINE: tuple[tuple[str, QLearning, Mitigation], ...] = (
@@ -32,7 +30,12 @@ HEADLINE: tuple[tuple[str, QLearning, Mitigation], ...] = (
 def scale(trap_reward: float = 4.0) -> tuple[Row, ...]:
     """Every headline agent on every grid of the paper, both panels."""
     return tuple(
-        row(Cell(paper_grid(size, trap_reward), mitigation, agent, panel), agent=label, size=size, panel=panel)
+        row(
+            Cell(paper_grid(size, trap_reward), mitigation, agent, as_panel(panel)),
+            agent=label,
+            size=size,
+            panel=panel,
+        )
         for size in SIZES
         for panel in PANELS
         for label, agent, mitigation in HEADLINE
@@ -42,7 +45,12 @@ def scale(trap_reward: float = 4.0) -> tuple[Row, ...]:
 def table3() -> tuple[Row, ...]:
     """10x10 at T = 100 (what Table 3 was run with) and T = 80 (what it says)."""
     return tuple(
-        row(Cell(paper_grid(10, horizon=t), mitigation, agent, panel), agent=label, horizon=t, panel=panel)
+        row(
+            Cell(paper_grid(10, horizon=t), mitigation, agent, as_panel(panel)),
+            agent=label,
+            horizon=t,
+            panel=panel,
+        )
         for t in (100, 80)
         for panel in PANELS
         for label, agent, mitigation in HEADLINE
@@ -58,7 +66,7 @@ def table4() -> tuple[Row, ...]:
         ("random walk", WALKER, RAW),
     )
     return tuple(
-        row(Cell(paper_grid(6), mitigation, agent, panel), agent=label, panel=panel)
+        row(Cell(paper_grid(6), mitigation, agent, as_panel(panel)), agent=label, panel=panel)
         for panel in PANELS
         for label, agent, mitigation in agents
     )
@@ -121,7 +129,7 @@ def noise() -> tuple[Row, ...]:
         for unit, sd in (("reward units", percent / 100), ("of the trap's reward", percent / 100 * 4.0)):
             for panel in PANELS:
                 for label, agent, mitigation in agents:
-                    cell = Cell(paper_grid(6), mitigation, agent, panel, noise=sd)
+                    cell = Cell(paper_grid(6), mitigation, agent, as_panel(panel), noise=sd)
                     rows.append(row(cell, agent=label, panel=panel, percent=percent, unit=unit))
     return tuple(rows)
 
@@ -129,7 +137,12 @@ def noise() -> tuple[Row, ...]:
 def uncertainty() -> tuple[Row, ...]:
     """Both uncertainties over training (G9): at the trap and elsewhere."""
     return tuple(
-        row(Cell(paper_grid(6), named(name), agent, panel, snapshots=50), agent=name, panel=panel, heads=heads)
+        row(
+            Cell(paper_grid(6), named(name), agent, as_panel(panel), snapshots=50),
+            agent=name,
+            panel=panel,
+            heads=heads,
+        )
         for panel in PANELS
         for name in ("uard-paper", "uard")
         for heads, agent in (("initial values", QLearning()), ("bootstrapped", BOOTSTRAPPED))

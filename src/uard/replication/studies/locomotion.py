@@ -10,9 +10,11 @@ from uard.agents.policy import PolicyGradient
 from uard.envs.locomotion.physics import Kick, Locomotion, Posture, Vibration
 from uard.lab.cell import Cell
 from uard.lab.registry import continuous_agents
+from uard.lab.studies.common import LOCOMOTION_STEPS, PANELS, RAW
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import named
-from uard.replication.studies.grids import PANELS, RAW
+from uard.ratings.panels import as_panel
+from uard.replication.studies import derive
 from uard.training.feedback.transition_model import QUERIES
 
 REGIONS = {"vibration": Vibration, "posture": Posture}
@@ -62,7 +64,7 @@ class Scale:
 
 ALL = tuple(name for name in continuous_agents() if name != "cpo-oracle")
 SMOKE = Scale("smoke", 4_096, 2_560, True, ("ppo", "sac"), ("hopper",))
-STANDARD = Scale("standard", 200_000, 50_000, True, ALL)
+STANDARD = Scale("standard", LOCOMOTION_STEPS, 50_000, True, ALL)
 PAPER = Scale("paper", 1_000_000, 1_000_000, False, ALL)
 
 
@@ -83,7 +85,7 @@ def hacking(scale: Scale) -> tuple[Row, ...]:
                     ("raw", lies, RAW, "main"),
                     *((m, lies, named(m), p) for m in ("uard-paper", "uard") for p in PANELS),
                 ):
-                    cell = _cell(where, mitigation, agent, steps, panel=panel)
+                    cell = _cell(where, mitigation, agent, steps, panel=as_panel(panel))
                     rows.append(row(cell, robot=robot, region=which, agent=name, mitigation=label, panel=panel))
     return tuple(rows)
 
@@ -93,7 +95,7 @@ def bonuses(scale: Scale) -> tuple[Row, ...]:
     agent, steps = scale.agents["ppo"]
     return tuple(
         row(
-            _cell(Locomotion(region=region(bonus=bonus)), named(mitigation), agent, steps, panel=panel),
+            _cell(Locomotion(region=region(bonus=bonus)), named(mitigation), agent, steps, panel=as_panel(panel)),
             region=which,
             bonus=bonus,
             mitigation=mitigation,
@@ -152,7 +154,7 @@ def ablation(scale: Scale) -> tuple[Row, ...]:
     }
     return tuple(
         row(
-            _cell(Locomotion(region=region()), named("uard", **changes), *scale.agents[name], panel=panel),
+            _cell(Locomotion(region=region()), named("uard", **changes), *scale.agents[name], panel=as_panel(panel)),
             agent=name,
             region=which,
             variant=variant,
@@ -191,7 +193,7 @@ def legitimate(scale: Scale) -> tuple[Row, ...]:
     agent, steps = scale.agents["ppo"]
     return tuple(
         row(
-            _cell(Locomotion(region=region(), legitimate=True), named(mitigation), agent, steps, panel=panel),
+            _cell(Locomotion(region=region(), legitimate=True), named(mitigation), agent, steps, panel=as_panel(panel)),
             region=which,
             mitigation=mitigation,
             panel=panel,
@@ -226,7 +228,7 @@ def rating(scale: Scale) -> tuple[Row, ...]:
     agent, steps = scale.agents["ppo"]
     return tuple(
         row(
-            _cell(Locomotion(region=region()), named("uard"), agent, steps, panel=panel, query=query),
+            _cell(Locomotion(region=region()), named("uard"), agent, steps, panel=as_panel(panel), query=query),
             region=which,
             panel=panel,
             query=query,
@@ -254,5 +256,6 @@ def studies(scale: Scale) -> tuple[Study, ...]:
             f"A distorted reward after training in MuJoCo, {scale.name}",
             "H13-H16, G12-G15",
             distortion(scale),
+            derive=derive.reactions,
         ),
     )

@@ -1,0 +1,1 @@
+"""What every floor may need and no user asks for."""

@@ -1,0 +1,54 @@
+"""``uard list``: all names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from uard.cli import terminal
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from uard.plugins import PluginError
+
+
+@dataclass(frozen=True)
+class List:
+    """List environments, agents, mitigations, panels and studies."""
+
+    def run(self, console: Console) -> None:
+        """Print them, and say which plugins cannot be used."""
+        from uard.lab import registry, studies
+        from uard.method import mitigations
+        from uard.ratings.panels import PANELS
+
+        theirs = {
+            kind: {p.name: f"{value} (of {p.package})" for p, value in registry.brought(kind)[0].items()}
+            for kind in registry.OWN
+        }
+        rows: dict[str, dict[str, str]] = {
+            "environments": {k: str(v) for k, v in registry.ENVIRONMENTS.items()} | theirs["environment"],
+            "agents": {k: str(v) for k, v in registry.AGENTS.items()} | theirs["agent"],
+            "agents for Hopper and Walker2d": {k: str(v) for k, v in registry.CONTINUOUS.items()},
+            "mitigations": {k: str(mitigations.named(k)) for k in mitigations.NAMED} | theirs["mitigation"],
+            "panels": {k: (v.__doc__ or "").split("\n")[0] for k, v in PANELS.items()},
+            **{
+                f"studies of {group}": {s.name: f"{s.title} ({s.answers}; {len(s.rows)} cells)" for s in members}
+                for group, members in studies.groups().items()
+            },
+        }
+        for title, entries in rows.items():
+            terminal.glossary(title, entries)
+        for error in broken():
+            terminal.warning(console, str(error))
+
+
+def broken() -> list[PluginError]:
+    """Return an error for everything that installed packages bring and that cannot be used."""
+    from uard.cli.app import brought as commands
+    from uard.lab import registry, studies
+    from uard.lab.views import published, sections
+
+    of_names = [error for kind in registry.OWN for error in registry.brought(kind)[1]]
+    return [*of_names, *commands()[1], *studies.broken(), *published.broken(), *sections.broken()]

@@ -1,0 +1,45 @@
+"""Bars and spinners on standard error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@contextmanager
+def bar(console: Console, what: str) -> Iterator[Callable[[int, int, float | None], None]]:
+    """Show a bar while the block runs.
+
+    Yields:
+        A function that moves it: how many are done, of how many, and seconds still to go if anybody knows.
+    """
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from uard.lab.views.status import duration
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"),
+    )
+    with Progress(*columns, console=console) as shown:
+        task = shown.add_task(what, total=None, left="")
+
+        def move(done: int, total: int, seconds: float | None) -> None:
+            left = "" if seconds is None else f"about {duration(seconds)} left" if done < total else "done"
+            shown.update(task, completed=done, total=total, left=left)
+
+        yield move
+
+
+@contextmanager
+def spinner(console: Console, what: str) -> Iterator[None]:
+    """Show that something of unknown length is going on while the block runs."""
+    with console.status(what):
+        yield

@@ -1,0 +1,137 @@
+"""``uard reproduce``: run studies and write the report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tyro.conf import Positional
+
+from uard import InvalidValueError, _checks
+from uard._support import files
+from uard.cli import progress, terminal, training
+from uard.cli.list import broken
+from uard.cli.settings import Names
+from uard.cli.training import DEFAULT_STORE, UNWATCHED, WatchOptions
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import Console
+
+    from uard.lab.execution.store import Store
+    from uard.lab.study import Study
+
+
+@dataclass(frozen=True)
+class Reproduce:
+    """Run studies, all grid studies if none is named, and write the report. Finished cells are never run again."""
+
+    studies: Positional[tuple[str, ...]] = ()
+    """Which studies or groups of them (see `uard list`): grid if left out, games, grid-deep."""
+    mitigation: Names = ()
+    """Let this one, your own perhaps, join every study that compares mitigations. Repeatable."""
+    seeds: int = 10
+    """Number of seeds (0, 1, ...)."""
+    report: str | None = None
+    """Write the report into this folder; only possible for the whole grid."""
+    extract: str | None = None
+    """Write what the report needs of these studies to this small JSON file (- for standard output)."""
+    store: str = DEFAULT_STORE
+    """Where finished seeds are kept."""
+    workers: int | None = None
+    """Processes; one per core if left out."""
+    engine: str = "local"
+    """Who trains: local (processes of this machine) or ray (a Ray cluster)."""
+    address: str | None = None
+    """Of the Ray cluster's head, host:port, or auto; if left out, Ray is started on this machine."""
+    gpus: float = 0.0
+    """GPUs of a Ray task, a fraction perhaps."""
+    failed: bool = False
+    """Only what failed when it was last tried."""
+    watch: WatchOptions = UNWATCHED
+
+    def run(self, console: Console) -> None:
+        """Train what is missing, then write the report or print the studies' tables."""
+        from uard.lab import studies
+        from uard.lab.execution.store import Store
+
+        _checks.whole("seeds", self.seeds, low=2, high=100_000)
+        terminal.check_workers(self.workers)
+        engine = self._engine()
+        unusable = [str(error) for error in broken()]
+        for text in unusable:
+            terminal.warning(console, text)
+        chosen = studies.find(self.studies, self.mitigation)
+        self._check_outputs(chosen)
+        store, seeds = Store(self.store), range(self.seeds)
+        self._train(chosen, store, console, engine)
+        if self.failed:
+            return
+        if self.extract is not None:
+            from uard.lab.views import published
+
+            line = f"uard reproduce {' '.join(self.studies)} --seeds {self.seeds}"
+            terminal.write_json(published.extract(chosen, store, seeds, line), self.extract, "extract", indent=None)
+        if self.report:
+            from uard.lab.views import page
+
+            with progress.spinner(console, "writing the report"):
+                written, errors = page.write(Path(self.report), store, seeds, self.mitigation)
+            for text in map(str, errors):
+                if text not in unusable:
+                    terminal.warning(console, text)
+            terminal.say(console, f"report: {written}")
+        else:
+            from uard.lab.views.evidence import Evidence
+            from uard.lab.views.tables import study_table
+
+            evidence = Evidence(store, seeds, chosen)
+            for study in chosen:
+                terminal.show(study_table(study, evidence))
+
+    def _engine(self) -> Any:
+        if _checks.choose("engine", self.engine, ("local", "ray")) == "ray":
+            from uard.lab.execution.cluster import Ray
+
+            if self.workers is not None:
+                raise InvalidValueError("workers", self.workers, "left out with --engine ray")
+            return Ray(self.address, self.gpus)
+        for option, given in (("address", self.address), ("gpus", self.gpus)):
+            if given:
+                raise InvalidValueError(option, given, "left out without --engine ray")
+        return None
+
+    def _check_outputs(self, chosen: Sequence[Study]) -> None:
+        """Refuse before training, not after it, what cannot be written."""
+        from uard.lab import studies
+
+        if self.report and {s.name for s in chosen} < {s.name for s in studies.grid()}:
+            raise InvalidValueError("report", self.report, "left out unless all grid studies are run")
+        if self.report:
+            files.prepare_folder(self.report, "report")
+        terminal.check_json(self.extract, "extract")
+        for name, given in (("report", self.report), ("extract", self.extract)):
+            if self.failed and given is not None:
+                raise InvalidValueError(name, given, "left out with --failed, which runs a part only")
+
+    def _train(self, chosen: Sequence[Study], store: Store, console: Console, engine: Any) -> None:
+        jobs = list(dict.fromkeys(job for study in chosen for job in study.jobs(range(self.seeds))))
+        if self.failed:
+            failures = store.failures()
+            jobs = [(cell, seed) for cell, seed in jobs if (cell.key, seed) in failures]
+        names = "".join(f"{name} " for name in self.studies)
+        trained = training.train(
+            jobs,
+            store,
+            console,
+            f"{len(chosen)} studies, {len(jobs)} runs",
+            self.watch,
+            workers=self.workers,
+            studies=chosen,
+            engine=engine,
+            again=f"only these again: uard reproduce {names}--seeds {self.seeds} --store {self.store} --failed\n"
+            f"their tracebacks: uard status {names}--store {self.store} --errors",
+        )
+        terminal.say(console, f"{trained} runs trained, {len(jobs) - trained} were in {self.store} already")

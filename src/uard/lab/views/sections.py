@@ -1,0 +1,80 @@
+"""Sections of the report: what this laboratory and installed packages have to show, each a part of one page."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from uard import _checks
+from uard.lab.views.evidence import Evidence
+from uard.plugins import Plugin, PluginError, brought
+
+PAGES = ("index.html", "leaderboard.html")  # that stand beside what sections write
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the report.
+
+    Attributes:
+        id: Where links lead to: letters, digits and hyphens, as in HTML.
+        title: Its heading.
+        order: Its place: sections are sorted by this number. Ours stand at 20 (where uard loses), 60 (every
+            mitigation), 75 (games), 90 (best-of-n) and 1000 (how the report was made).
+        html: What it says below its heading; taken as it is, so text in it must be escaped
+            (``uard.lab.views.templates``).
+        label: What the navigation calls it; the title if empty.
+        css: Rules for it.
+        js: A program for it, in a scope of its own. Nothing on the page may be loaded from elsewhere.
+        losses: Where ``uard`` fails or is beaten, in sentences: they stand in the section of that name.
+        files: What else is written beside the page: texts by their names.
+    """
+
+    id: str
+    title: str
+    order: float
+    html: str
+    label: str = ""
+    css: str = ""
+    js: str = ""
+    losses: tuple[str, ...] = ()
+    files: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        if not re.fullmatch(r"[a-z][a-z0-9-]*", self.id):
+            raise _checks.InvalidValueError("id", self.id, "small letters, digits and hyphens")
+        _checks.number("order", self.order)
+        for name in self.files:
+            if not re.fullmatch(r"\w[\w.-]*", name) or name in PAGES:
+                raise _checks.InvalidValueError("files", name, f"a plain name, none of {', '.join(PAGES)}")
+
+
+def of_packages(evidence: Evidence, ours: Iterable[Section]) -> tuple[list[Section], list[PluginError]]:
+    """Return the sections that packages bring, and what of it is broken.
+
+    Args:
+        evidence: What they are made from.
+        ours: Whose ids and files nobody else may have.
+    """
+    taken = {name for section in ours for name in (section.id, *section.files)}
+
+    def read(plugin: Plugin) -> list[Section]:
+        made = plugin.call(evidence)
+        if not (isinstance(made, list | tuple) and all(isinstance(s, Section) for s in made)):
+            raise PluginError(plugin, f"{_checks.short(made)} is no list of Section")
+        new = [name for section in made for name in (section.id, *section.files)]
+        for name in new:
+            if name in taken or new.count(name) > 1:
+                raise PluginError(plugin, f"the name {name!r} of its section or file is taken")
+        taken.update(new)
+        return list(made)
+
+    good, bad = brought("report", read)
+    return [section for made in good.values() for section in made], bad
+
+
+def broken() -> list[PluginError]:
+    """Return an error for each package's sections that cannot be imported."""
+    return brought("report", Plugin.get)[1]

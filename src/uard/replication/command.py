@@ -1,0 +1,55 @@
+"""``uard ledger``: joins the command line by the door of plugins (``uard.plugins``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+from uard import _checks
+from uard.cli import terminal, training
+from uard.cli.training import DEFAULT_STORE, UNWATCHED, WatchOptions
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """Say of every claim of the paper that a grid can answer whether it holds."""
+
+    claims: Positional[tuple[str, ...]] = ()
+    """Only these, e.g. J5 F3; all if left out."""
+    json: str | None = None
+    """Write the ledger as JSON to this file; - for standard output."""
+    seeds: int = 10
+    """Number of seeds (0, 1, ...)."""
+    store: str = DEFAULT_STORE
+    """Where finished seeds are kept; what is missing is trained first."""
+    workers: int | None = None
+    """Processes; one per core if left out."""
+    watch: WatchOptions = UNWATCHED
+
+    def run(self, console: Console) -> None:
+        """Train what is missing, then print the ledger."""
+        from uard.lab import studies
+        from uard.lab.execution.store import Store
+        from uard.lab.views.evidence import Evidence
+        from uard.replication import ledger
+
+        _checks.whole("seeds", self.seeds, low=2, high=100_000)
+        terminal.check_workers(self.workers)
+        terminal.check_json(self.json)
+        for claim in self.claims:
+            _checks.choose("claim", claim, ledger.CLAIMS)
+        store, seeds, grid = Store(self.store), range(self.seeds), studies.grid()
+        jobs = [job for study in grid for job in study.jobs(seeds)]
+        what = "what the ledger needs"
+        training.train(jobs, store, console, what, self.watch, workers=self.workers, studies=grid)
+        evidence = Evidence(store, seeds, grid)
+        entries = [e for e in ledger.entries(evidence) if not self.claims or e.claim in self.claims]
+        if self.json is not None:
+            terminal.write_json(ledger.as_data(entries, seeds), self.json)
+        if self.json != "-":
+            ledger.to_rich(entries)

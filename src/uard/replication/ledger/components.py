@@ -1,0 +1,174 @@
+"""Which source, which lambda and which rule does the work on the grids (J31-J34, J38)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from uard.lab import statistics
+from uard.lab.statistics import Summary
+from uard.lab.views.evidence import Evidence
+from uard.replication import paper
+from uard.replication.ledger.claim import Conditions, below
+from uard.replication.ledger.filters import READINGS
+from uard.replication.ledger.grids import FEW
+from uard.replication.verdicts import Opinion, Part, each
+
+_PASSIVE = ("Ablation I", "Ablation II")
+
+
+def _undiscounted(e: Evidence) -> dict[str, Any]:
+    base = e.per_seed("table5", "trap_visits", variant="Baseline Q-Learning")
+    tests = [statistics.welch(base, e.per_seed("table5", "trap_visits", variant=v)) for v in _PASSIVE]
+    printed = {row.variant: row.visits.mean for row in paper.TABLE_5}
+    return {
+        "fewer": {v: t.difference for v, t in zip(_PASSIVE, tests, strict=True)},
+        "p": dict(zip(_PASSIVE, statistics.holm([t.p for t in tests]), strict=True)),
+        "printed": printed["Baseline"] - printed["Ablation II"],
+    }
+
+
+J31 = Conditions(
+    (
+        *each(
+            "{} makes fewer visits than the baseline (Holm, p < .05)",
+            _PASSIVE,
+            lambda n, v: n["fewer"][v] > 0 and n["p"][v] < 0.05,
+        ),
+        *each(
+            "{} makes hardly fewer: by the printed difference at most",
+            _PASSIVE,
+            lambda n, v: n["fewer"][v] <= n["printed"],
+        ),
+    ),
+    _undiscounted,
+)
+
+
+def _sources(e: Evidence) -> dict[str, Any]:
+    variants = {"lite": "No sigma_h (UARD-lite)", "human": "No sigma_m (Human-only)", "both": "UARD (Full)"}
+    return {k: e.get("table5", "trap_visits", variant=v, reading="uard-paper") for k, v in variants.items()}
+
+
+J32 = Conditions(
+    (
+        Part("without sigma_h it hacks more than with both (intervals apart)", lambda n: below(n["both"], n["lite"])),
+        Part("without sigma_m it hacks more than with both (intervals apart)", lambda n: below(n["both"], n["human"])),
+        Part("sigma_m alone prevents more than sigma_h alone", lambda n: n["lite"].mean < n["human"].mean),
+    ),
+    _sources,
+)
+
+
+def _evolution(e: Evidence) -> dict[str, Any]:
+    runs = e.results(e.row("uncertainty", agent="uard-paper", panel="main", heads="bootstrapped").cell)
+    curves = np.stack([r.extra["uncertainty"] for r in runs]).astype(float)
+    sources = _sources(e)
+    return {
+        "peak": statistics.summarise(curves[:, :, 0].max(1)),
+        "end": statistics.summarise(curves[:, -1, 0]),
+        "human": statistics.summarise(curves[:, -1, 2]),
+        "elsewhere": statistics.summarise(curves[:, -1, 3]),
+        "lite": sources["lite"],
+        "both": sources["both"],
+    }
+
+
+J33 = Conditions(
+    (
+        Part(
+            "sigma_m at the trap falls: it ends below its peak (intervals apart)",
+            lambda n: below(n["end"], n["peak"]),
+        ),
+        Part(
+            "sigma_h persists: at the trap it ends above five times what it is elsewhere",
+            lambda n: n["human"].mean > 5 * n["elsewhere"].mean,
+        ),
+        Part("without sigma_h the agent hacks: more than one visit", lambda n: n["lite"].mean > FEW),
+        Part("with it no seed relapses: less than one visit in each", lambda n: max(n["both"].per_seed) < FEW),
+    ),
+    _evolution,
+)
+
+_LAMBDA = {"small": 1.0, "usual": 2.0, "five": 5.0, "large": 50.0}
+SENSITIVITY = {f"{name}, {size}x{size}": (reading, size) for name, reading in READINGS.items() for size in (6, 10)}
+
+
+def _sensitivity(e: Evidence) -> dict[str, Any]:
+    def at(metric: str, lam: float) -> dict[str, Summary]:
+        return {
+            name: e.get("sensitivity", metric, reading=reading, size=size, lam=lam)
+            for name, (reading, size) in SENSITIVITY.items()
+        }
+
+    return {
+        **{f"visits_{name}": at("trap_visits", _LAMBDA[name]) for name in ("small", "usual", "five")},
+        **{f"true_{name}": at("true_return", _LAMBDA[name]) for name in ("usual", "large")},
+    }
+
+
+J34 = Conditions(
+    (
+        *each(
+            "{}: with lambda 1 it hacks more than with 2 (intervals apart)",
+            SENSITIVITY,
+            lambda n, s: below(n["visits_usual"][s], n["visits_small"][s]),
+        ),
+        *each(
+            "{}: with lambda 5 it makes less than one visit per episode",
+            SENSITIVITY,
+            lambda n, s: n["visits_five"][s].mean < FEW,
+        ),
+        *each(
+            "{}: with lambda 50 its true return is lower than with 2 (intervals apart)",
+            SENSITIVITY,
+            lambda n, s: below(n["true_large"][s], n["true_usual"][s]),
+        ),
+    ),
+    _sensitivity,
+)
+
+_LIMITS, _RESPONSES = ("0.25", "0.5", "1"), ("safe", "ask", "skip")
+
+
+def _deferring(e: Evidence) -> dict[str, Any]:
+    def visits(limit: str, response: str) -> Summary:
+        return e.get("abstention", "trap_visits", rule="threshold", limit=float(limit), response=response)
+
+    def deferred(limit: str) -> float:
+        return float(e.curves("abstention", "abstained", rule="threshold", limit=float(limit), response="safe").mean())
+
+    rows = e.studies["abstention"].rows
+    best = max(rows, key=lambda r: e.of(r.cell, "true_return").mean)
+    solved = [r for r in rows if e.of(r.cell, "trap_visits").mean < 0.5 and e.of(r.cell, "goal_rate").mean > 0.9]
+    return {
+        "deferred": {limit: deferred(limit) for limit in _LIMITS},
+        "visits": {response: visits(_LIMITS[0], response) for response in _RESPONSES},
+        "none": e.get("abstention", "trap_visits", rule="none"),
+        "best": f"{best['rule']} {best['limit']:g}, {best['response']}",
+        "best_true": e.of(best.cell, "true_return"),
+        "none_true": e.get("abstention", "true_return", rule="none"),
+        "settings": len(rows) - 1,
+        "solved": len(solved),
+    }
+
+
+J38 = Conditions(
+    (
+        Opinion("the paper shows a run in which the agent abstains", False),
+        *each(
+            "an agent whose uncertainty has a threshold of {} defers at least once in a hundred episodes",
+            _LIMITS,
+            lambda n, limit: n["deferred"][limit] > 0.01,
+        ),
+        *each(
+            "threshold 0.25, response {}: who defers makes fewer visits than who never does (intervals apart)",
+            _RESPONSES,
+            lambda n, response: below(n["visits"][response], n["none"]),
+        ),
+    ),
+    _deferring,
+)
+
+CONDITIONS = {"J31": J31, "J32": J32, "J33": J33, "J34": J34, "J38": J38}

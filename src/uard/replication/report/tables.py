@@ -1,0 +1,155 @@
+"""The paper's tables beside ours, what a reader must see first, and Theorem 1 measured."""
+
+from __future__ import annotations
+
+from uard.lab.views.evidence import Evidence
+from uard.lab.views.tables import Table, brief, full, number
+from uard.replication import paper, theory
+
+
+def headline(e: Evidence) -> list[dict[str, str]]:
+    """Return the four agents on 10x10 at the paper's T = 80, both panels: what a reader must see first."""
+    rows = []
+    for agent in ("baseline", "random walk", "uard-paper", "uard-consistent", "uard"):
+        for panel in ("main", "appendix"):
+            if agent in ("baseline", "random walk") and panel == "appendix":
+                continue
+            get = [
+                e.get("scale", m, agent=agent, size=10, panel=panel)
+                for m in ("trap_visits", "goal_rate", "true_return")
+            ]
+            name = agent if agent in ("baseline", "random walk") else f"{agent}, {panel} panel"
+            rows.append({"agent": name, "visits": full(get[0]), "goal": full(get[1]), "true": full(get[2])})
+    return rows
+
+
+def tables(e: Evidence) -> list[Table]:
+    """Return the paper's tables 2 to 5 beside ours."""
+    return [_table2(e), _table3(e), _table4(e), _table5(e)]
+
+
+def _stat(s: paper.Stat | None) -> str:
+    return "–" if s is None else f"{s.mean:g} ± {s.sd:g}"
+
+
+def _table2(e: Evidence) -> Table:
+    rows = []
+    for p in paper.TABLE_2:
+        ours = [
+            e.get("scale", "trap_visits", agent=a, size=p.size, panel="main")
+            for a in ("uard-paper", "uard", "baseline")
+        ]
+        rows.append(
+            (f"{p.size}x{p.size}", _stat(p.uard), full(ours[0]), full(ours[1]), _stat(p.baseline), full(ours[2]))
+        )
+    return Table(
+        "Table 2 (F2): trap visits by grid",
+        ("grid", "paper: UARD", "ours: uard-paper", "ours: uard", "paper: baseline", "ours: baseline"),
+        tuple(rows),
+        1,
+        "Ours per episode, main panel, T = 40/60/80. The paper's first row is per episode, its others exceed what an episode has room for.",
+    )
+
+
+def _table3(e: Evidence) -> Table:
+    rows = [
+        (p.method, "paper", _stat(p.reward), _stat(p.visits), "–", "–", f"{p.reduction:g} %") for p in paper.TABLE_3
+    ]
+    for t in (100, 80):
+        base = e.get("table3", "trap_visits", agent="baseline", horizon=t, panel="main")
+        for agent in ("baseline", "uard-paper", "uard-consistent", "uard", "random walk"):
+            r = e.row("table3", agent=agent, horizon=t, panel="main")
+            v, o, g, true = (e.of(r.cell, m) for m in ("trap_visits", "observed_return", "goal_rate", "true_return"))
+            cut = f"{100 * (1 - v.mean / base.mean):.1f} %"
+            total = f"{number(100 * v.mean)} ± {number(100 * v.sd)}"
+            rows.append((agent, f"ours, T = {t}", brief(o), total, brief(g), brief(true), cut))
+    return Table(
+        "Table 3 (F3): 10x10, last 100 episodes",
+        ("method", "source", "mean reward", "trap visits (total)", "goal rate", "true return", "reduction"),
+        tuple(rows),
+        2,
+        "Our baseline here is tabular Q-learning, main panel; deep ones stand in a section of their own. Note the random walk.",
+    )
+
+
+def _table4(e: Evidence) -> Table:
+    names = {"Baseline": "baseline", "Multi-Head": "multi-head", "UARD": "uard-paper"}
+    rows = []
+    for p in paper.TABLE_4:
+        rows.append(
+            (p.agent, "paper", _stat(p.true_return), _stat(p.observed_return), _stat(p.visits), _stat(p.gap), "–")
+        )
+        for panel in ("main", "appendix"):
+            rows.append(_row4(e, names[p.agent], panel))
+    for panel in ("main", "appendix"):
+        rows.append(_row4(e, "uard-consistent", panel))
+        rows.append(_row4(e, "uard", panel))
+    return Table(
+        "Table 4 (F4): 6x6",
+        ("agent", "source", "true return", "observed return", "trap visits", "alignment gap", "goal rate"),
+        tuple(rows),
+        2,
+        "The paper's 'episode 500'; ours are the last 100 episodes. The gap is |observed - true| per episode.",
+    )
+
+
+def _row4(e: Evidence, agent: str, panel: str) -> tuple[str, ...]:
+    r = e.row("table4", agent=agent, panel=panel)
+    metrics = ("true_return", "observed_return", "trap_visits", "alignment_gap", "goal_rate")
+    return (agent, f"ours, {panel}", *(full(e.of(r.cell, m)) for m in metrics))
+
+
+def _table5(e: Evidence) -> Table:
+    rows = []
+    variant = {
+        "Baseline": "Baseline Q-Learning",
+        "UARD-lite": "No sigma_h (UARD-lite)",
+        "Human-only": "No sigma_m (Human-only)",
+        "UARD": "UARD (Full)",
+    }
+    for p in paper.TABLE_5:
+        name = variant.get(p.variant, p.variant)
+        cells = []
+        for reading in ("uard-paper", "uard-consistent", "uard-operator", "uard"):
+            found = list(e.studies["table5"].where(variant=name, reading=reading if p.discounting else "-"))
+            v, g = e.of(found[0].cell, "trap_visits"), e.of(found[0].cell, "goal_rate")
+            cells.append(f"{brief(v)} (goal {g.mean:.2f})")
+        rows.append((p.variant, _stat(p.visits), *cells))
+    return Table(
+        "Table 5 (F5): which component does the work",
+        ("variant", "paper", "as printed (acts on J)", "consistent backup", "T_lambda (on reward)", "ours (uard)"),
+        tuple(rows),
+        1,
+        "Trap visits per episode, 6x6, main panel, heads bootstrapped with probability 0.5. Without sigma_h no reading of the paper works. Ours then still has its anchor and lambda_t, which come from the ratings too.",
+    )
+
+
+def theory_tables() -> list[Table]:
+    """Return what was measured of Theorem 1."""
+    rows = [
+        (
+            f"{t.size}x{t.size}",
+            f"{t.trap:+g}",
+            t.panel,
+            "none" if t.critical is None else number(t.critical),
+            "yes" if t.critical is None or t.critical > 2 else "no",
+        )
+        for t in theory.critical_lambdas()
+    ]
+    critical = Table(
+        "Smallest lambda at which the fixed point of T_lambda stops hacking",
+        ("grid", "trap", "raters", "critical lambda", "hacks at lambda = 2"),
+        tuple(rows),
+        3,
+        "By exact solution, gamma = 0.95, beta = 0.5, sigma_m = 0 (its limit).",
+    )
+    rows = [
+        (
+            "contraction ratio, weights frozen, 1000 random pairs per grid",
+            f"{theory.contraction():.4f}",
+            "<= 0.95: Theorem 1 holds",
+        ),
+        ("ensemble map, weights following sigma_m(Q)", f"{theory.live_expansion():.2f}", "> 1: not a contraction"),
+        ("fixed points from 20 random starts differ by", f"{theory.fixed_point_spread():.1e}", "unique"),
+    ]
+    return [critical, Table("Theorem 1, measured", ("what", "value", "reading"), tuple(rows), 1)]
