@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -40,7 +41,8 @@ class FilterOutcome(NamedTuple):
     learned: Float[np.ndarray, " n"]
 
 
-class Case(NamedTuple):
+@dataclass(frozen=True)
+class Case:
     """A log of which only usable numbers are left, and what the filters make of it.
 
     Attributes:

@@ -24,7 +24,7 @@ from uard import _checks
 from uard.method.weights import Form, ReliabilityFilter, discount
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Integer
+    from jaxtyping import Bool, Float, Integer, Real
 
 _TIE = 1e-9  # values closer than this count as equal, and then the first action is taken
 
@@ -138,7 +138,7 @@ def _tables(
     return entered, learned, np.where(ends, 0.0, gamma)
 
 
-def _like(field: str, value: Any, table: Float[np.ndarray, "S A"]) -> Float[np.ndarray, ...]:
+def _like(field: str, value: Any, table: Float[np.ndarray, "S A"]) -> Float[np.ndarray, "*any"]:
     """Return a number or an (S, A) table as a float array that broadcasts to ``table``."""
     array = _checks.as_numpy(field, value)
     if array.ndim != 0:
@@ -157,7 +157,7 @@ def _apply(
 
 def backup(
     q: Float[np.ndarray, "*batch S A"],
-    reward: Float[np.ndarray, "S A"],
+    reward: Real[np.ndarray, "S A"],
     weight: float | Float[np.ndarray, "S A"],
     next_state: Integer[np.ndarray, "S A"],
     terminal: Bool[np.ndarray, "S A"],
@@ -193,7 +193,7 @@ def backup(
 
 
 def fixed_point(
-    reward: Float[np.ndarray, "S A"],
+    reward: Real[np.ndarray, "S A"],
     weight: float | Float[np.ndarray, "S A"],
     next_state: Integer[np.ndarray, "S A"],
     terminal: Bool[np.ndarray, "S A"],
@@ -245,7 +245,7 @@ def fixed_point(
 
 
 def solve(
-    reward: Float[np.ndarray, "S A"],
+    reward: Real[np.ndarray, "S A"],
     weight: float | Float[np.ndarray, "S A"],
     next_state: Integer[np.ndarray, "S A"],
     terminal: Bool[np.ndarray, "S A"],
@@ -301,7 +301,7 @@ def _evaluate(
 
 
 def contraction_ratio(
-    reward: Float[np.ndarray, "S A"],
+    reward: Real[np.ndarray, "S A"],
     weight: float | Float[np.ndarray, "S A"],
     next_state: Integer[np.ndarray, "S A"],
     terminal: Bool[np.ndarray, "S A"],
@@ -347,7 +347,7 @@ def contraction_ratio(
 
 def ensemble_backup(
     heads: Float[np.ndarray, "S A N"],
-    reward: Float[np.ndarray, "S A"],
+    reward: Real[np.ndarray, "S A"],
     next_state: Integer[np.ndarray, "S A"],
     terminal: Bool[np.ndarray, "S A"],
     gamma: float,
@@ -393,7 +393,7 @@ def ensemble_backup(
 
 
 def live_weight_expansion(
-    reward: Float[np.ndarray, "S A"],
+    reward: Real[np.ndarray, "S A"],
     next_state: Integer[np.ndarray, "S A"],
     terminal: Bool[np.ndarray, "S A"],
     gamma: float,

@@ -108,7 +108,7 @@ def sigma_human(
     return _masked_std(ratings, here if xp.isdtype(here.dtype, "bool") else here != 0, axis, ddof, empty)
 
 
-def _floats(field: str, values: Any, mask: Array | None = None) -> Float[Array, ...]:
+def _floats(field: str, values: Any, mask: Array | None = None) -> Float[Array, "*rest"]:
     """Return an array of floats: lists become NumPy's, integers (stars, thumbs) become floats."""
     if not hasattr(values, "shape") or (isinstance(values, _NUMPY) and values.dtype.kind != "f"):
         if mask is not None:
@@ -120,7 +120,7 @@ def _floats(field: str, values: Any, mask: Array | None = None) -> Float[Array, 
     return values if xp.isdtype(values.dtype, "real floating") else xp.astype(values, xp.asarray(0.0).dtype)
 
 
-def deviation(values: Float[Array, ...], axis: int, ddof: int) -> Float[Array, ...]:
+def deviation(values: Float[Array, "*any"], axis: int, ddof: int) -> Float[Array, "*rest"]:
     """Standard deviation along an axis, nothing checked; its gradient where all agree is 0, see ``root``."""
     xp = namespace(values)
     size = values.shape[axis]
@@ -137,7 +137,7 @@ def root(variance: Float[Array, "*any"]) -> Float[Array, "*any"]:
 
 def _masked_std(
     ratings: Float[Array, "*any"], mask: Bool[Array, "*any"], axis: int, ddof: int, empty: float | None
-) -> Float[Array, ...]:
+) -> Float[Array, "*rest"]:
     xp = namespace(ratings)
     values = xp.where(mask, ratings, xp.zeros_like(ratings))
     _checks.finite("ratings", values)
@@ -215,8 +215,8 @@ def shrink(sigma: Numbers, count: Numbers, prior: Numbers, strength: Numbers = 1
 class Location(NamedTuple):
     """Mean and mean absolute deviation of a quantity over distinct state-actions, in its unit."""
 
-    location: Float[Array, ""]
-    mad: Float[Array, ""]
+    location: Float[Array, ""] | float
+    mad: Float[Array, ""] | float
 
 
 def location_and_mad(values: Float[Array, "*batch"], mask: Bool[Array, "*batch"]) -> Location:

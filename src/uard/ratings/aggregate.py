@@ -15,11 +15,11 @@ from uard.method.arrays import Array, namespace
 from uard.method.feedback import ByRater, Feedback
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Integer
+    from jaxtyping import Bool, Float, Integer, Real
 
 
 def aggregate(
-    ratings: Float[Array, "*batch K"],
+    ratings: Real[Array, "*batch K"],
     proxy: Float[Array, "*batch"],
     mask: Bool[Array, "*batch K"] | None = None,
     ddof: int = 0,
@@ -31,8 +31,8 @@ def aggregate(
     ([1.0, 0.0], [0.5, 0.0], [-1.0, 0.0], [2.0, 0.0])
 
     Args:
-        ratings: A column per rater, in reward units. Without a mask NaN is a missing rating; inside a JAX
-            transformation, where NaN cannot be looked for, ratings without a mask are complete.
+        ratings: A column per rater, in reward units; stars and thumbs become floats. Without a mask NaN is a missing
+            rating; inside a JAX transformation, where NaN cannot be looked for, ratings without a mask are complete.
         proxy: The observed reward.
         mask: True where a rating exists; what is masked out may hold anything.
         ddof: Of the deviation; a visit with no more ratings than that has a deviation of 0.
@@ -46,7 +46,13 @@ def aggregate(
     if ratings.ndim == 0 or ratings.shape[-1] == 0 or tuple(ratings.shape[:-1]) != tuple(proxy.shape):
         allowed = f"({', '.join([*map(str, proxy.shape), 'K'])}): one row per reward and one column per rater"
         raise _checks.InvalidValueError("ratings.shape", tuple(ratings.shape), allowed)
-    if mask is None and not _checks.is_traced(ratings):
+    if getattr(ratings.dtype, "kind", "") != "f":  # neither NumPy's floats nor JAX's
+        xp = namespace(ratings)
+        if not xp.isdtype(ratings.dtype, "real floating"):
+            ratings = xp.astype(ratings, xp.asarray(0.0).dtype)
+    if mask is not None:
+        _checks.same_shape("mask", mask, "ratings", ratings)
+    elif not _checks.is_traced(ratings):
         finite = namespace(ratings).isfinite(ratings)
         if not finite.all():
             mask = ratings == ratings
@@ -198,17 +204,17 @@ def by_item(visits: Feedback, item: Integer[np.ndarray, " n"]) -> Feedback:
     """
     assert visits.by_rater is not None
     size, raters = int(item.max(initial=-1)) + 1, visits.by_rater.count.shape[-1]
-    count = np.bincount(item, visits.count, size)
-    share = np.maximum(count, 1.0)
 
-    def mean(column: np.ndarray) -> np.ndarray:
-        return np.bincount(item, column * visits.count, size) / share
+    def total(column: Float[np.ndarray, " n"]) -> Float[np.ndarray, " M"]:
+        return np.bincount(item, column, size).astype(float)  # of nothing it counts in whole numbers
 
+    count = total(visits.count)
     each = ByRater._make(np.zeros((size, raters)) for _ in range(3))
     for k in range(raters):
         here, rating = visits.by_rater.count[:, k], visits.by_rater.mean[:, k]
-        each.count[:, k] = np.bincount(item, here, size)
-        each.mean[:, k] = np.bincount(item, here * rating, size) / np.maximum(each.count[:, k], 1.0)
-        each.m2[:, k] = np.bincount(item, here * (rating - each.mean[item, k]) ** 2, size)
-    columns = [mean(x) for x in (visits.mean, visits.lowest, visits.sd, visits.proxy)]
+        each.count[:, k] = total(here)
+        each.mean[:, k] = total(here * rating) / np.maximum(each.count[:, k], 1.0)
+        each.m2[:, k] = total(here * (rating - each.mean[item, k]) ** 2)
+    of_all = (visits.mean, visits.lowest, visits.sd, visits.proxy)
+    columns = [total(x * visits.count) / np.maximum(count, 1.0) for x in of_all]
     return Feedback._make([count, *columns, (each.count > 0).sum(-1).astype(float), each])

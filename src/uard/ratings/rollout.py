@@ -38,7 +38,8 @@ def rollout(env: Any, steps: int = 1000, seed: int = 0) -> RatingLog:
             raise bad_cell("rollout", row, "ratings", columns["ratings"][row], "a row of K ratings, as in the first")
     name = "rollout" if env.spec is None else env.spec.id
     source = f"{name}, {steps} random steps, seed {seed}"
-    arrays: dict[str, Any] = {"ratings": np.zeros((steps, 0))} | columns
+    arrays: dict[str, Any] = {"ratings": np.zeros((steps, 0))}
+    arrays |= {name: np.asarray(column) for name, column in columns.items()}
     return RatingLog(**arrays, source=source)
 
 

@@ -20,7 +20,7 @@ def groups_of(prompts: Sequence[Any]) -> Integer[np.ndarray, " B"]:
     [0, 0, 1]
     """
     texts = [repr(prompt) for prompt in prompts]
-    return np.cumsum([i > 0 and text != texts[i - 1] for i, text in enumerate(texts)])
+    return np.cumsum([i > 0 and text != texts[i - 1] for i, text in enumerate(texts)], dtype=int)
 
 
 def advantage_change(

@@ -24,8 +24,8 @@ class PanelStatistics(NamedTuple):
     """
 
     disagreement: uncertainty.Location
-    scale: Float[Array, ""]
-    lowest: Float[Array, ""]
+    scale: Float[Array, ""] | float
+    lowest: Float[Array, ""] | float
 
 
 def fit(feedback: Feedback, rated: Bool[Array, "*batch"], proxy_is_rater: bool) -> PanelStatistics:
