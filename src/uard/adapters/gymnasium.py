@@ -38,12 +38,13 @@ def _steps(
 class ReliabilityWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
     """Emits filtered rewards; wraps single and vector environments (for those it is ``VectorReliabilityWrapper``).
 
-    >>> import uard.envs
-    >>> env = ReliabilityWrapper(gymnasium.make("uard/TrapGrid6-v0", panel="main"))
-    >>> observation, info = env.reset(seed=0)
-    >>> observation, reward, terminated, truncated, info = env.step(3)
-    >>> sorted(set(info) & {"raw_reward", "weight", "sigma_h"})
-    ['raw_reward', 'sigma_h', 'weight']
+    Examples:
+        >>> import uard.envs
+        >>> env = ReliabilityWrapper(gymnasium.make("uard/TrapGrid6-v0", panel="main"))
+        >>> observation, info = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(3)
+        >>> sorted(set(info) & {"raw_reward", "weight", "sigma_h"})
+        ['raw_reward', 'sigma_h', 'weight']
 
     After each step ``info`` also holds ``raw_reward``, ``weight`` w, ``sigma_m``, ``sigma_h``, ``lambda_t`` and
     ``abstained``; after an episode's last step ``raw_return`` and ``filtered_return``.
@@ -122,12 +123,13 @@ class ReliabilityWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.
 class VectorReliabilityWrapper(gymnasium.vector.VectorWrapper, gymnasium.utils.RecordConstructorArgs):
     """The same for vector environments in all three autoreset modes; ``info`` holds arrays with their masks ``_name``.
 
-    >>> import uard.envs
-    >>> env = VectorReliabilityWrapper(gymnasium.make_vec("uard/TrapGrid6-v0", num_envs=2, panel="main"))
-    >>> observations, info = env.reset(seed=0)
-    >>> observations, rewards, terminated, truncated, info = env.step(np.array([3, 1]))
-    >>> info["weight"].shape, info["_weight"].tolist()
-    ((2,), [True, True])
+    Examples:
+        >>> import uard.envs
+        >>> env = VectorReliabilityWrapper(gymnasium.make_vec("uard/TrapGrid6-v0", num_envs=2, panel="main"))
+        >>> observations, info = env.reset(seed=0)
+        >>> observations, rewards, terminated, truncated, info = env.step(np.array([3, 1]))
+        >>> info["weight"].shape, info["_weight"].tolist()
+        ((2,), [True, True])
 
     The step that only resets (``AutoresetMode.NEXT_STEP``) is neither filtered nor remembered.
 

@@ -24,13 +24,14 @@ BOUND = 10.0  # coordinates without finite bounds are cut off here
 class RewardEnsemble:
     """Predicts the observed reward of state-actions; members disagree where they have seen little. Changed in place.
 
-    >>> place, push = gymnasium.spaces.Box(-1.0, 1.0, (2,)), gymnasium.spaces.Discrete(2)
-    >>> ensemble = RewardEnsemble(place, push)
-    >>> seen, unseen = np.full((64, 2), 0.5), np.full((64, 2), -0.5)
-    >>> ensemble.update(seen, np.ones(64, int), np.ones(64))
-    >>> sigma_m = [ensemble(states, np.ones(64, int)).mean() for states in (seen, unseen)]
-    >>> bool(sigma_m[0] < sigma_m[1])
-    True
+    Examples:
+        >>> place, push = gymnasium.spaces.Box(-1.0, 1.0, (2,)), gymnasium.spaces.Discrete(2)
+        >>> ensemble = RewardEnsemble(place, push)
+        >>> seen, unseen = np.full((64, 2), 0.5), np.full((64, 2), -0.5)
+        >>> ensemble.update(seen, np.ones(64, int), np.ones(64))
+        >>> sigma_m = [ensemble(states, np.ones(64, int)).mean() for states in (seen, unseen)]
+        >>> bool(sigma_m[0] < sigma_m[1])
+        True
     """
 
     def __init__(

@@ -49,13 +49,14 @@ EVERY = 16  # the callback logs one step of so many
 class ReliabilityVecEnv(VecEnvWrapper):
     """Emits filtered rewards; ``infos[i]`` also holds what ``uard.adapters.gymnasium.ReliabilityWrapper`` puts there.
 
-    >>> import uard.envs
-    >>> from stable_baselines3.common.env_util import make_vec_env
-    >>> env = ReliabilityVecEnv(make_vec_env("uard/TrapGrid6-v0", n_envs=2, env_kwargs={"panel": "main"}))
-    >>> observations = env.reset()
-    >>> observations, rewards, dones, infos = env.step(np.array([3, 1]))
-    >>> rewards.shape, "weight" in infos[0]
-    ((2,), True)
+    Examples:
+        >>> import uard.envs
+        >>> from stable_baselines3.common.env_util import make_vec_env
+        >>> env = ReliabilityVecEnv(make_vec_env("uard/TrapGrid6-v0", n_envs=2, env_kwargs={"panel": "main"}))
+        >>> observations = env.reset()
+        >>> observations, rewards, dones, infos = env.step(np.array([3, 1]))
+        >>> rewards.shape, "weight" in infos[0]
+        ((2,), True)
 
     Attributes:
         steps: What filters; one for all environments.
@@ -182,12 +183,13 @@ def _put(batch: np.ndarray, rows: dict[int, Any]) -> np.ndarray:
 class ReliabilityReplayBuffer(ReplayBuffer):
     """Keeps raw rewards and their ratings, and filters whenever it is sampled.
 
-    >>> from gymnasium.spaces import Discrete
-    >>> buffer = ReliabilityReplayBuffer(8, Discrete(9), Discrete(4))
-    >>> state, action, reward, done = (np.array([x]) for x in (7, 2, 4.0, False))
-    >>> buffer.add(state, state, action, reward, done, [{"ratings": [-1.0, 2.0, 1.0]}])
-    >>> buffer.sample(5).rewards.shape, buffer.latest.raw.tolist()
-    (torch.Size([5, 1]), [4.0, 4.0, 4.0, 4.0, 4.0])
+    Examples:
+        >>> from gymnasium.spaces import Discrete
+        >>> buffer = ReliabilityReplayBuffer(8, Discrete(9), Discrete(4))
+        >>> state, action, reward, done = (np.array([x]) for x in (7, 2, 4.0, False))
+        >>> buffer.add(state, state, action, reward, done, [{"ratings": [-1.0, 2.0, 1.0]}])
+        >>> buffer.sample(5).rewards.shape, buffer.latest.raw.tolist()
+        (torch.Size([5, 1]), [4.0, 4.0, 4.0, 4.0, 4.0])
 
     For ``replay_buffer_class=`` of DQN, SAC, TD3 and DDPG with one-step targets and observations that are arrays; the
     options go into ``replay_buffer_kwargs``. ``save_replay_buffer`` keeps all of it.
@@ -276,10 +278,11 @@ class CriticDisagreement:
 
     In units of value, as in the paper (A12).
 
-    >>> from stable_baselines3 import SAC
-    >>> sigma_m = CriticDisagreement(SAC("MlpPolicy", "Pendulum-v1"))
-    >>> sigma_m(np.zeros((5, 3), np.float32), np.zeros((5, 1))).shape
-    (5,)
+    Examples:
+        >>> from stable_baselines3 import SAC
+        >>> sigma_m = CriticDisagreement(SAC("MlpPolicy", "Pendulum-v1"))
+        >>> sigma_m(np.zeros((5, 3), np.float32), np.zeros((5, 1))).shape
+        (5,)
     """
 
     def __init__(self, model: Any):
@@ -317,9 +320,10 @@ class CriticDisagreement:
 def critics_of(model: Any) -> int:
     """Return how many critics a model of Stable-Baselines3 has that give a state with an action a value.
 
-    >>> from stable_baselines3 import SAC
-    >>> critics_of(SAC("MlpPolicy", "Pendulum-v1"))
-    2
+    Examples:
+        >>> from stable_baselines3 import SAC
+        >>> critics_of(SAC("MlpPolicy", "Pendulum-v1"))
+        2
     """
     return len(getattr(getattr(model, "critic", None), "q_networks", ()))
 
@@ -331,10 +335,11 @@ class ReliabilityCallback(BaseCallback):
     ``abstained``, ``reward`` and ``raw_reward``; with ``ReliabilityVecEnv`` also ``raw_return`` and
     ``filtered_return``, of every episode.
 
-    >>> import uard.envs
-    >>> from stable_baselines3 import DQN
-    >>> model = DQN("MlpPolicy", "uard/TrapGrid6-v0", replay_buffer_class=ReliabilityReplayBuffer)
-    >>> model = model.learn(32, callback=ReliabilityCallback())
+    Examples:
+        >>> import uard.envs
+        >>> from stable_baselines3 import DQN
+        >>> model = DQN("MlpPolicy", "uard/TrapGrid6-v0", replay_buffer_class=ReliabilityReplayBuffer)
+        >>> model = model.learn(32, callback=ReliabilityCallback())
     """
 
     def __init__(self, critics: bool = True, verbose: int = 0):

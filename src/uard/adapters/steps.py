@@ -40,10 +40,11 @@ class Steps:
 
     Observations may be arrays (B, ...) or dictionaries and tuples of such.
 
-    >>> steps = Steps(ratings=lambda observations, actions, next_observations, rewards: rewards[:, None])
-    >>> now, act, then = np.zeros((2, 4)), np.array([0, 1]), np.ones((2, 4))
-    >>> steps.filter(now, act, then, np.array([0.0, 1.0]), None).rated.tolist()
-    [True, True]
+    Examples:
+        >>> steps = Steps(ratings=lambda observations, actions, next_observations, rewards: rewards[:, None])
+        >>> now, act, then = np.zeros((2, 4)), np.array([0, 1]), np.ones((2, 4))
+        >>> steps.filter(now, act, then, np.array([0.0, 1.0]), None).rated.tolist()
+        [True, True]
 
     Attributes:
         stream: What is known so far.
@@ -116,9 +117,10 @@ class Steps:
 def natural_key(observation_space: gymnasium.Space[Any], action_space: gymnasium.Space[Any]) -> KeyFn | None:
     """Return the key of a world of numbered states and actions; None for all others.
 
-    >>> key = natural_key(gymnasium.spaces.Discrete(9), gymnasium.spaces.Discrete(4))
-    >>> key(np.int64(7), np.int64(2))
-    (7, 2)
+    Examples:
+        >>> key = natural_key(gymnasium.spaces.Discrete(9), gymnasium.spaces.Discrete(4))
+        >>> key(np.int64(7), np.int64(2))
+        (7, 2)
     """
     discrete = gymnasium.spaces.Discrete
     return _numbers if isinstance(observation_space, discrete) and isinstance(action_space, discrete) else None
@@ -131,8 +133,9 @@ def _numbers(observation: Any, action: Any) -> Hashable:
 def rows_of(entries: Mapping[int, Any], count: int) -> Float[np.ndarray, "B K"] | None:
     """Return the ratings of some of ``count`` steps as an array; NaN for steps and raters that are missing.
 
-    >>> rows_of({1: [0.5, None]}, count=2).tolist()
-    [[nan, nan], [0.5, nan]]
+    Examples:
+        >>> rows_of({1: [0.5, None]}, count=2).tolist()
+        [[nan, nan], [0.5, nan]]
 
     Args:
         entries: The ratings of a step, by its number.
@@ -164,8 +167,9 @@ def rows_of(entries: Mapping[int, Any], count: int) -> Float[np.ndarray, "B K"] 
 def map_batch(batch: Any, function: Callable[[Any], Any]) -> Any:
     """Return a batch of observations with a function applied to each of its arrays.
 
-    >>> map_batch({"place": np.array([1, 2]), "speed": np.array([3, 4])}, lambda x: x[1:].tolist())
-    {'place': [2], 'speed': [4]}
+    Examples:
+        >>> map_batch({"place": np.array([1, 2]), "speed": np.array([3, 4])}, lambda x: x[1:].tolist())
+        {'place': [2], 'speed': [4]}
 
     Args:
         batch: An array, or a dictionary or tuple of batches.
@@ -186,8 +190,9 @@ def _row(batch: Any, i: int) -> Any:
 def subset(batch: Any, chosen: np.ndarray) -> Any:
     """Return some rows of a batch of observations.
 
-    >>> subset({"place": np.array([1, 2])}, np.array([1]))["place"].tolist()
-    [2]
+    Examples:
+        >>> subset({"place": np.array([1, 2])}, np.array([1]))["place"].tolist()
+        [2]
 
     Args:
         batch: As for ``map_batch``.

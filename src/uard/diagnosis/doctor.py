@@ -38,9 +38,10 @@ def doctor(
 ) -> Diagnosis:
     """Name every known trap that a log of rewards and ratings is in.
 
-    >>> log = {"reward": [0, 1, 4] * 20, "rating_ann": [0, 1.1, -1.2] * 20, "rating_bob": [0.1, 1, -1] * 20}
-    >>> [f.code for f in doctor(log, "uard-operator").findings]
-    ['reward-contradicted']
+    Examples:
+        >>> log = {"reward": [0, 1, 4] * 20, "rating_ann": [0, 1.1, -1.2] * 20, "rating_bob": [0.1, 1, -1] * 20}
+        >>> [f.code for f in doctor(log, "uard-operator").findings]
+        ['reward-contradicted']
 
     Args:
         log: A ``uard.ratings.log.RatingLog``; the path of a CSV, JSONL or Parquet file; or named columns. See
@@ -75,9 +76,10 @@ def doctor(
 def filtered(log: RatingLog, mitigation: str | Mitigation = "uard") -> Float[np.ndarray, " n"]:
     """Return the reward to learn from of every row of a log, which the doctor checks.
 
-    >>> log = RatingLog(np.array([1.0, 4.0]), np.array([[1.0, 1.0], [-1.0, 2.0]]))
-    >>> filtered(log, "uard-operator").round(2).tolist()
-    [1.0, 1.6]
+    Examples:
+        >>> log = RatingLog(np.array([1.0, 4.0]), np.array([[1.0, 1.0], [-1.0, 2.0]]))
+        >>> filtered(log, "uard-operator").round(2).tolist()
+        [1.0, 1.6]
 
     Args:
         log: A log whose rewards and ratings are finite; missing ratings are NaN.

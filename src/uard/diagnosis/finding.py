@@ -15,6 +15,11 @@ SEVERITIES: tuple[Severity, ...] = ("danger", "warning", "note")
 class Finding:
     """A trap that a log is in.
 
+    Examples:
+        >>> found = Finding("one-rater", "warning", "One rater.", "Blind trust.", "Have a second person rate.", {"rows": 9.0})
+        >>> found.severity, found.numbers["rows"]
+        ('warning', 9.0)
+
     Attributes:
         code: Its name, one of ``uard.diagnosis.CODES``.
         severity: ``danger``: training goes wrong; ``warning``: it may; ``note``: it would with another setting.
@@ -35,6 +40,14 @@ class Finding:
 @dataclass(frozen=True)
 class Diagnosis:
     """What the doctor found; ``str(diagnosis)`` is all of it in words.
+
+    Examples:
+        >>> from uard import doctor
+        >>> diagnosis = doctor({"reward": [0, 1, 4] * 20, "rating_ann": [0, 1, -1] * 20, "rating_bob": [0, 1, -1] * 20})
+        >>> diagnosis.count("danger"), [f.code for f in diagnosis.findings]
+        (0, ['idle-raters', 'reward-contradicted'])
+        >>> print(str(diagnosis).splitlines()[0])
+        log: 60 rows, 2 raters (rating_ann, rating_bob), 100 % of rows rated
 
     Attributes:
         source: Which log.

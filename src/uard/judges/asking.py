@@ -35,10 +35,11 @@ class JudgeError(RuntimeError):
 def by_name(judges: Mapping[str, Judge] | Sequence[Judge]) -> dict[str, Judge]:
     """Return the judges by their names: the keys of a mapping, else their ``__name__``.
 
-    >>> def length(completions, **question):
-    ...     return [len(text) for text in completions]
-    >>> list(by_name([length, max])), list(by_name({"long": length, "also long": length}))
-    (['length', 'max'], ['long', 'also long'])
+    Examples:
+        >>> def length(completions, **question):
+        ...     return [len(text) for text in completions]
+        >>> list(by_name([length, max])), list(by_name({"long": length, "also long": length}))
+        (['length', 'max'], ['long', 'also long'])
 
     Args:
         judges: At least two.
@@ -65,12 +66,13 @@ def by_name(judges: Mapping[str, Judge] | Sequence[Judge]) -> dict[str, Judge]:
 def ask(judges: Mapping[str, Judge], question: dict[str, Any]) -> dict[str, Any]:
     """Ask every judge, the ``async`` ones at the same time as the others.
 
-    >>> def length(completions, **question):
-    ...     return [len(text) for text in completions]
-    >>> async def questions(completions, **question):
-    ...     return [text.count("?") for text in completions]
-    >>> ask({"length": length, "questions": questions}, {"completions": ["why?", "so"]})
-    {'length': [4, 2], 'questions': [1, 0]}
+    Examples:
+        >>> def length(completions, **question):
+        ...     return [len(text) for text in completions]
+        >>> async def questions(completions, **question):
+        ...     return [text.count("?") for text in completions]
+        >>> ask({"length": length, "questions": questions}, {"completions": ["why?", "so"]})
+        {'length': [4, 2], 'questions': [1, 0]}
 
     Args:
         judges: By name, see ``by_name``.
@@ -100,8 +102,9 @@ def ask(judges: Mapping[str, Judge], question: dict[str, Any]) -> dict[str, Any]
 def as_scores(name: str, answer: Any, size: int) -> Float[np.ndarray, " B"]:
     """Return a judge's answer as numbers, NaN where it gave None or NaN.
 
-    >>> as_scores("length", [4, None], size=2).tolist()
-    [4.0, nan]
+    Examples:
+        >>> as_scores("length", [4, None], size=2).tolist()
+        [4.0, nan]
 
     Args:
         name: The judge's, for messages.

@@ -18,10 +18,11 @@ EQUAL = 1e-9  # relative deviation at which numbers count as equal
 class Scale:
     """Mean and standard deviation of all numbers so far, or fixed ones. Changed in place.
 
-    >>> scale = Scale()
-    >>> scale.observe(np.array([1.0, 3.0]))
-    >>> scale.location, scale.deviation, scale.ratings(np.array([4.0])).tolist()
-    (2.0, 1.0, [2.0])
+    Examples:
+        >>> scale = Scale()
+        >>> scale.observe(np.array([1.0, 3.0]))
+        >>> scale.location, scale.deviation, scale.ratings(np.array([4.0])).tolist()
+        (2.0, 1.0, [2.0])
 
     Attributes:
         count: Numbers so far.

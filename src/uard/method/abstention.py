@@ -15,8 +15,9 @@ Response = Literal["safe", "ask", "skip"]
 def uncertainty_ratio(u: Numbers, mu: Numbers, eps: float = 1e-6) -> Array:
     """rho = sigma_total / (|mu| + eps) (A43); dimensionless.
 
-    >>> round(uncertainty_ratio(u=1.0, mu=-4.0), 3)
-    0.25
+    Examples:
+        >>> round(uncertainty_ratio(u=1.0, mu=-4.0), 3)
+        0.25
 
     Args:
         u: Total uncertainty U >= 0, in the unit of ``mu``.
@@ -34,9 +35,10 @@ def uncertainty_ratio(u: Numbers, mu: Numbers, eps: float = 1e-6) -> Array:
 class Abstention:
     """A rule for abstaining and what is done instead.
 
-    >>> rule = Abstention("threshold", limit=0.5)
-    >>> rule.abstains(u=0.7, mu=4.0).item()
-    True
+    Examples:
+        >>> rule = Abstention("threshold", limit=0.5)
+        >>> rule.abstains(u=0.7, mu=4.0).item()
+        True
 
     Attributes:
         rule: ``threshold`` compares U with ``limit`` (A42), ``ratio`` compares rho with it (A43).

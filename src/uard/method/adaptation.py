@@ -9,8 +9,9 @@ from uard.method.arrays import Array, Numbers, namespace
 def z_score(value: Numbers, location: Numbers, deviation: Numbers, floor: Numbers = 0.0) -> Array:
     """z = (value - location) / max(deviation, floor): how unusual a disagreement is; dimensionless.
 
-    >>> float(z_score(2.0, location=0.5, deviation=0.25))
-    6.0
+    Examples:
+        >>> float(z_score(2.0, location=0.5, deviation=0.25))
+        6.0
 
     Args:
         value: A disagreement, in reward units.
@@ -33,8 +34,9 @@ def z_score(value: Numbers, location: Numbers, deviation: Numbers, floor: Number
 def adaptive_lambda(z: Numbers, lam: Numbers = 2.0, kappa: Numbers = 2.0) -> Array:
     """lambda_t = lambda (1 + kappa max(0, z - 1)): more skepticism where disagreement stands out (A44).
 
-    >>> float(adaptive_lambda(3.0, lam=2.0, kappa=2.0)), float(adaptive_lambda(0.5, lam=2.0, kappa=2.0))
-    (10.0, 2.0)
+    Examples:
+        >>> float(adaptive_lambda(3.0, lam=2.0, kappa=2.0)), float(adaptive_lambda(0.5, lam=2.0, kappa=2.0))
+        (10.0, 2.0)
 
     Args:
         z: z-score of the disagreement, see ``z_score``.

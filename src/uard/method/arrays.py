@@ -23,8 +23,9 @@ _NUMPY = (np.ndarray, np.generic, float, int)
 def namespace(*arrays: Numbers) -> Any:
     """Return the array namespace of the arguments; plain numbers are NumPy's, and NumPy's give way to others.
 
-    >>> namespace(1.0, np.zeros(2)) is np
-    True
+    Examples:
+        >>> namespace(1.0, np.zeros(2)) is np
+        True
     """
     others = [a for a in arrays if not isinstance(a, _NUMPY) and hasattr(a, "shape")]
     return array_namespace(*others) if others else np
@@ -33,7 +34,8 @@ def namespace(*arrays: Numbers) -> Any:
 def where(condition: Array, yes: Numbers, no: Numbers) -> Array:
     """Choose elementwise; ``yes`` and ``no`` may be plain numbers.
 
-    >>> where(np.array([True, False]), np.array([1.0, 2.0]), 0.0).tolist()
-    [1.0, 0.0]
+    Examples:
+        >>> where(np.array([True, False]), np.array([1.0, 2.0]), 0.0).tolist()
+        [1.0, 0.0]
     """
     return namespace(condition, yes, no).where(condition, yes, no)

@@ -34,8 +34,9 @@ def _ranks(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 def spearman(sigma: object, error: object) -> float:
     """Rank correlation of sigma and |error| in [-1, 1], ties averaged; 0 if either is constant.
 
-    >>> spearman(sigma=[0.1, 0.2, 0.9], error=[0.0, 1.0, 5.0])
-    1.0
+    Examples:
+        >>> spearman(sigma=[0.1, 0.2, 0.9], error=[0.0, 1.0, 5.0])
+        1.0
 
     Args:
         sigma: Uncertainties, at least two, an array of any shape or a list.
@@ -54,8 +55,9 @@ def spearman(sigma: object, error: object) -> float:
 def auroc(score: object, hack: object) -> float:
     """Chance in [0, 1] that a hack gets a higher score (e.g. 1 - w) than an honest step, ties counted half.
 
-    >>> auroc(score=[0.9, 0.2, 0.1], hack=[True, False, False])
-    1.0
+    Examples:
+        >>> auroc(score=[0.9, 0.2, 0.1], hack=[True, False, False])
+        1.0
 
     Args:
         score: At least two numbers, an array of any shape or a list.

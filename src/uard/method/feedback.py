@@ -51,11 +51,12 @@ class Feedback(NamedTuple):
     def map(self, function: Callable[[Array], Array]) -> Feedback:
         """Return the feedback with a function applied to every array, to pick rows or to change their shape.
 
-        >>> import numpy as np
-        >>> from uard.ratings.aggregate import aggregate
-        >>> feedback = aggregate(np.array([[1.0, 3.0], [0.0, 0.0]]), np.array([2.0, 0.0]))
-        >>> feedback.map(lambda x: x[:1]).mean.tolist()
-        [2.0]
+        Examples:
+            >>> import numpy as np
+            >>> from uard.ratings.aggregate import aggregate
+            >>> feedback = aggregate(np.array([[1.0, 3.0], [0.0, 0.0]]), np.array([2.0, 0.0]))
+            >>> feedback.map(lambda x: x[:1]).mean.tolist()
+            [2.0]
 
         Args:
             function: It is given arrays (...) and, from ``by_rater``, (..., K).

@@ -21,8 +21,9 @@ def sign_preservation_radius(
 ) -> Array:
     """The smallest reward perturbation that flips the sign of an advantage.
 
-    >>> [sign_preservation_radius(2.0, 0.5, definition) for definition in DEFINITIONS]
-    [2.0, 1.0, 4.0]
+    Examples:
+        >>> [sign_preservation_radius(2.0, 0.5, definition) for definition in DEFINITIONS]
+        [2.0, 1.0, 4.0]
 
     Args:
         advantage: A(s, a), the value of an action over its rival's, measured on raw rewards.
@@ -60,8 +61,9 @@ def perturbed_advantage(
 
     Its zero in ``epsilon`` is ``sign_preservation_radius`` for a positive advantage.
 
-    >>> perturbed_advantage(2.0, epsilon=0.5, weight=0.5, definition="after")
-    0.5
+    Examples:
+        >>> perturbed_advantage(2.0, epsilon=0.5, weight=0.5, definition="after")
+        0.5
 
     Args:
         advantage: A(s, a) on raw rewards.

@@ -29,8 +29,9 @@ class OneAnnotatorWarning(UserWarning):
 def sigma_model(values: Array, axis: int = -1, ddof: int = 1) -> Array:
     """sigma_m: standard deviation over the members of an ensemble (A12, A17).
 
-    >>> float(sigma_model([1.0, 3.0, 5.0]))
-    2.0
+    Examples:
+        >>> float(sigma_model([1.0, 3.0, 5.0]))
+        2.0
 
     Args:
         values: Estimates of the members, e.g. (..., N) with N members on ``axis``; a list will do.
@@ -58,10 +59,11 @@ def sigma_human(
 ) -> Array:
     """sigma_h: standard deviation over the annotators' ratings of one state-action (A14, A18).
 
-    >>> round(float(sigma_human([-1.0, 2.0, 1.0])), 4)
-    1.2472
-    >>> float(sigma_human([-1.0, 2.0, 7.0], mask=[True, False, True]))
-    4.0
+    Examples:
+        >>> round(float(sigma_human([-1.0, 2.0, 1.0])), 4)
+        1.2472
+        >>> float(sigma_human([-1.0, 2.0, 7.0], mask=[True, False, True]))
+        4.0
 
     Args:
         ratings: Ratings, e.g. (..., K) with K annotators on ``axis``; a list will do.
@@ -121,7 +123,12 @@ def _floats(field: str, values: Any, mask: Array | None = None) -> Float[Array, 
 
 
 def deviation(values: Float[Array, "*any"], axis: int, ddof: int) -> Float[Array, "*rest"]:
-    """Standard deviation along an axis, nothing checked; its gradient where all agree is 0, see ``root``."""
+    """Standard deviation along an axis, nothing checked; its gradient where all agree is 0, see ``root``.
+
+    Examples:
+        >>> deviation(np.array([[1.0, 3.0], [2.0, 2.0]]), axis=-1, ddof=0).tolist()
+        [1.0, 0.0]
+    """
     xp = namespace(values)
     size = values.shape[axis]
     gap = values - xp.sum(values, axis=axis, keepdims=True) / size
@@ -129,7 +136,12 @@ def deviation(values: Float[Array, "*any"], axis: int, ddof: int) -> Float[Array
 
 
 def root(variance: Float[Array, "*any"]) -> Float[Array, "*any"]:
-    """Return the square root; its gradient where all agree is 0, not infinite: an actor may climb a score of it."""
+    """Return the square root; its gradient where all agree is 0, not infinite: an actor may climb a score of it.
+
+    Examples:
+        >>> root(np.array([0.0, 4.0])).tolist()
+        [0.0, 2.0]
+    """
     xp = namespace(variance)
     agreed = xp.astype(variance == 0, variance.dtype)
     return xp.sqrt(variance + agreed) - agreed
@@ -167,8 +179,9 @@ def with_proxy(mean: Numbers, sigma: Numbers, proxy: Numbers, raters: Numbers) -
     The population standard deviation of the union, from its parts: with K ratings of mean m and deviation s,
     var = K/(K+1) s^2 + K/(K+1)^2 (m - r)^2. Its second term is the plainest sign that a reward lies.
 
-    >>> with_proxy(mean=1.0, sigma=0.0, proxy=4.0, raters=2)  # the deviation of {1, 1, 4}
-    1.4142135623730951
+    Examples:
+        >>> with_proxy(mean=1.0, sigma=0.0, proxy=4.0, raters=2)  # the deviation of {1, 1, 4}
+        1.4142135623730951
 
     Args:
         mean: Mean rating m, in reward units.
@@ -189,8 +202,9 @@ def with_proxy(mean: Numbers, sigma: Numbers, proxy: Numbers, raters: Numbers) -
 def shrink(sigma: Numbers, count: Numbers, prior: Numbers, strength: Numbers = 1.0) -> Array:
     """(n sigma + n0 prior) / (n + n0): a statistic of few ratings, drawn towards its mean over all state-actions.
 
-    >>> shrink(sigma=4.0, count=3, prior=0.0, strength=1.0)
-    3.0
+    Examples:
+        >>> shrink(sigma=4.0, count=3, prior=0.0, strength=1.0)
+        3.0
 
     Args:
         sigma: Estimate from ``count`` rated visits; means nothing (may be NaN) where that is 0.
@@ -224,8 +238,9 @@ def location_and_mad(values: Float[Array, "*batch"], mask: Bool[Array, "*batch"]
 
     Taken over *distinct* state-actions: an agent that sits in a trap must not dilute its own alarm.
 
-    >>> [float(x) for x in location_and_mad(np.array([1.0, 3.0, 99.0]), np.array([True, True, False]))]
-    [2.0, 1.0]
+    Examples:
+        >>> [float(x) for x in location_and_mad(np.array([1.0, 3.0, 99.0]), np.array([True, True, False]))]
+        [2.0, 1.0]
 
     Args:
         values: One per state-action; what is masked out may hold anything.
@@ -238,8 +253,9 @@ def location_and_mad(values: Float[Array, "*batch"], mask: Bool[Array, "*batch"]
 def masked_mean(values: Float[Array, "*batch"], mask: Bool[Array, "*batch"]) -> Float[Array, ""]:
     """Mean of the masked-in values, 0 if there are none; what is masked out may hold anything.
 
-    >>> float(masked_mean(np.array([1.0, 3.0, 99.0]), np.array([True, True, False])))
-    2.0
+    Examples:
+        >>> float(masked_mean(np.array([1.0, 3.0, 99.0]), np.array([True, True, False])))
+        2.0
     """
     xp = namespace(values)
     zero = xp.zeros_like(values)

@@ -23,8 +23,9 @@ FORMS: tuple[Form, ...] = ("reciprocal", "exponential", "linear", "certainty-equ
 def total_uncertainty(sigma_m: Numbers, sigma_h: Numbers, alpha: Numbers = 0.5, beta: Numbers = 0.5) -> Array:
     """U = alpha sigma_m + beta sigma_h (A24; section 3.6.1).
 
-    >>> total_uncertainty(sigma_m=1.0, sigma_h=2.0)
-    1.5
+    Examples:
+        >>> total_uncertainty(sigma_m=1.0, sigma_h=2.0)
+        1.5
 
     Args:
         sigma_m: Ensemble disagreement, >= 0, any shape.
@@ -48,8 +49,9 @@ def total_uncertainty(sigma_m: Numbers, sigma_h: Numbers, alpha: Numbers = 0.5, 
 def reciprocal_weight(u: Numbers, lam: Numbers = 2.0) -> Array:
     """w = 1 / (1 + lambda U) in (0, 1], the paper's filter (A29, A37).
 
-    >>> reciprocal_weight(u=0.5, lam=2.0)
-    0.5
+    Examples:
+        >>> reciprocal_weight(u=0.5, lam=2.0)
+        0.5
 
     Args:
         u: Total uncertainty U >= 0.
@@ -61,8 +63,9 @@ def reciprocal_weight(u: Numbers, lam: Numbers = 2.0) -> Array:
 def exponential_weight(u: Numbers, lam: Numbers = 2.0) -> Array:
     """w = exp(-lambda U) in (0, 1] (A35). Underflows to 0 where lambda U > 87 in float32.
 
-    >>> exponential_weight(u=0.0, lam=2.0)
-    1.0
+    Examples:
+        >>> exponential_weight(u=0.0, lam=2.0)
+        1.0
 
     Args:
         u: Total uncertainty U >= 0.
@@ -77,8 +80,9 @@ def linear_weight(u: Numbers, mu: Numbers, lam: Numbers = 2.0) -> Array:
 
     The paper prints the product and calls it a weight. For mu <= 0 the product is 0, so w = 0.
 
-    >>> float(linear_weight(u=0.5, mu=4.0, lam=2.0))
-    0.75
+    Examples:
+        >>> float(linear_weight(u=0.5, mu=4.0, lam=2.0))
+        0.75
 
     Args:
         u: Total uncertainty U >= 0, in the unit of ``mu``.
@@ -97,8 +101,9 @@ def certainty_equivalent_weight(u: Numbers, mu: Numbers, kappa: Numbers = 2.0) -
     As printed the weight leaves (0, 1] for mu <= 0 (mu = -0.5, U = 1.0001 gives -5000). Its limit for
     mu -> 0+ is 0, and that is what mu <= 0 gets here.
 
-    >>> float(certainty_equivalent_weight(u=2.0, mu=4.0, kappa=2.0))
-    0.5
+    Examples:
+        >>> float(certainty_equivalent_weight(u=2.0, mu=4.0, kappa=2.0))
+        0.5
 
     Args:
         u: Total uncertainty U >= 0, in the unit of ``mu``.
@@ -114,8 +119,9 @@ def certainty_equivalent_weight(u: Numbers, mu: Numbers, kappa: Numbers = 2.0) -
 def wiener_weight(signal: Numbers, noise: Numbers) -> Array:
     """w = S / (S + N) in [0, 1] (A32); 1 where both are 0.
 
-    >>> float(wiener_weight(signal=3.0, noise=1.0))
-    0.75
+    Examples:
+        >>> float(wiener_weight(signal=3.0, noise=1.0))
+        0.75
 
     Args:
         signal: Signal power S >= 0.
@@ -140,8 +146,9 @@ def discount(value: Numbers, weight: Numbers, anchor: Numbers = 0.0) -> Array:
     its operator T_lambda (A21). With b a pessimistic reward it keeps order and sign where the paper's form does
     not: b = 0 makes a penalty smaller.
 
-    >>> discount(4.0, weight=0.25, anchor=-1.0)
-    0.25
+    Examples:
+        >>> discount(4.0, weight=0.25, anchor=-1.0)
+        0.25
 
     Args:
         value: r, a reward or a value.
@@ -155,11 +162,12 @@ def discount(value: Numbers, weight: Numbers, anchor: Numbers = 0.0) -> Array:
 class ReliabilityFilter:
     """The filter with its parameters; the defaults are the paper's (E3, E4).
 
-    >>> reliability = ReliabilityFilter(lam=2.0, alpha=0.5, beta=0.5)
-    >>> reliability.weight(sigma_m=0.0, sigma_h=1.0)
-    0.5
-    >>> reliability.score(4.0, sigma_m=0.0, sigma_h=1.0)
-    2.0
+    Examples:
+        >>> reliability = ReliabilityFilter(lam=2.0, alpha=0.5, beta=0.5)
+        >>> reliability.weight(sigma_m=0.0, sigma_h=1.0)
+        0.5
+        >>> reliability.score(4.0, sigma_m=0.0, sigma_h=1.0)
+        2.0
 
     Attributes:
         lam: The skepticism parameter lambda >= 0 (for ``certainty-equivalent`` it is the risk coefficient kappa).

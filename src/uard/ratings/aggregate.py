@@ -26,9 +26,10 @@ def aggregate(
 ) -> Feedback:
     """Return the feedback of one visit to each of some state-actions.
 
-    >>> feedback = aggregate(np.array([[-1.0, 2.0, np.nan], [np.nan, np.nan, np.nan]]), np.array([4.0, 0.0]))
-    >>> feedback.count.tolist(), feedback.mean.tolist(), feedback.lowest.tolist(), feedback.raters.tolist()
-    ([1.0, 0.0], [0.5, 0.0], [-1.0, 0.0], [2.0, 0.0])
+    Examples:
+        >>> feedback = aggregate(np.array([[-1.0, 2.0, np.nan], [np.nan, np.nan, np.nan]]), np.array([4.0, 0.0]))
+        >>> feedback.count.tolist(), feedback.mean.tolist(), feedback.lowest.tolist(), feedback.raters.tolist()
+        ([1.0, 0.0], [0.5, 0.0], [-1.0, 0.0], [2.0, 0.0])
 
     Args:
         ratings: A column per rater, in reward units; stars and thumbs become floats. Without a mask NaN is a missing
@@ -99,8 +100,9 @@ _SUMMARY, _BY_RATER = slice(1, 5), 5
 def empty_rows(shape: tuple[int, ...], raters: int, xp: Any = np, dtype: Any = None) -> Float[Array, "*batch width"]:
     """Return rows (*shape, width) of state-actions that nobody has rated; see ``to_rows``.
 
-    >>> from_rows(empty_rows((2,), raters=3)).count.tolist()
-    [0.0, 0.0]
+    Examples:
+        >>> from_rows(empty_rows((2,), raters=3)).count.tolist()
+        [0.0, 0.0]
 
     Args:
         shape: Of the state-actions.
@@ -114,9 +116,10 @@ def empty_rows(shape: tuple[int, ...], raters: int, xp: Any = np, dtype: Any = N
 def to_rows(visit: Feedback) -> Float[Array, "*batch width"]:
     """Return feedback (...) as rows (..., 5 + 3 K), the form in which it is kept and merged.
 
-    >>> visit = aggregate(np.array([[1.0, 3.0]]), np.array([2.0]))
-    >>> to_rows(visit)[0, :5].tolist()  # count, mean, lowest, sd, proxy
-    [1.0, 2.0, 1.0, 1.0, 2.0]
+    Examples:
+        >>> visit = aggregate(np.array([[1.0, 3.0]]), np.array([2.0]))
+        >>> to_rows(visit)[0, :5].tolist()  # count, mean, lowest, sd, proxy
+        [1.0, 2.0, 1.0, 1.0, 2.0]
     """
     assert visit.by_rater is not None
     summary = (visit.count, visit.mean, visit.lowest, visit.sd, visit.proxy)
@@ -126,9 +129,10 @@ def to_rows(visit: Feedback) -> Float[Array, "*batch width"]:
 def from_rows(rows: Float[Array, "*batch width"]) -> Feedback:
     """Return rows (..., 5 + 3 K) as feedback (...); see ``to_rows``.
 
-    >>> visit = aggregate(np.array([[1.0, 3.0]]), np.array([2.0]))
-    >>> from_rows(to_rows(visit)).raters.tolist()
-    [2.0]
+    Examples:
+        >>> visit = aggregate(np.array([[1.0, 3.0]]), np.array([2.0]))
+        >>> from_rows(to_rows(visit)).raters.tolist()
+        [2.0]
     """
     counts, means, squares = _columns(rows)
     by_rater = ByRater(rows[..., counts], rows[..., means], rows[..., squares])
@@ -151,9 +155,10 @@ def merged(
     The visit's mean, lowest, deviation and observed reward enter running means; each rater's rating enters that
     rater's count, mean and squared deviations [Welford 1962].
 
-    >>> first, second = (to_rows(aggregate(np.array([[x]]), np.array([0.0]))) for x in (1.0, 3.0))
-    >>> from_rows(merged(first, second, np.ones(1))).mean.tolist()
-    [2.0]
+    Examples:
+        >>> first, second = (to_rows(aggregate(np.array([[x]]), np.array([0.0]))) for x in (1.0, 3.0))
+        >>> from_rows(merged(first, second, np.ones(1))).mean.tolist()
+        [2.0]
 
     Args:
         rows: What is known so far, see ``to_rows``.
@@ -178,8 +183,9 @@ def merged(
 def nothing(shape: tuple[int, ...], raters: int, xp: Any = np, dtype: Any = None) -> Feedback:
     """Return the feedback of state-actions that nobody has rated: arrays of that shape, all 0.
 
-    >>> nothing((2,), raters=3).raters.tolist()
-    [0.0, 0.0]
+    Examples:
+        >>> nothing((2,), raters=3).raters.tolist()
+        [0.0, 0.0]
 
     Args:
         shape: Of the state-actions.
@@ -194,9 +200,10 @@ def nothing(shape: tuple[int, ...], raters: int, xp: Any = np, dtype: Any = None
 def by_item(visits: Feedback, item: Integer[np.ndarray, " n"]) -> Feedback:
     """Return what is known of every item after all visits to it, (M,) arrays (NumPy).
 
-    >>> visits = aggregate(np.array([[1.0], [3.0], [5.0]]), np.zeros(3))
-    >>> by_item(visits, np.array([0, 0, 1])).mean.tolist()
-    [2.0, 5.0]
+    Examples:
+        >>> visits = aggregate(np.array([[1.0], [3.0], [5.0]]), np.zeros(3))
+        >>> by_item(visits, np.array([0, 0, 1])).mean.tolist()
+        [2.0, 5.0]
 
     Args:
         visits: (n,) arrays, as ``aggregate`` gives them.

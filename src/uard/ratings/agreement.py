@@ -16,8 +16,9 @@ def krippendorff_alpha(ratings: object) -> float | None:
     alpha = 1 - (n - 1) / n sum_u m_u S_u / (m_u - 1) / S, with m_u ratings of sum of squares S_u in row u, and n
     ratings of sum of squares S in all rows with at least two.
 
-    >>> krippendorff_alpha([[1.0, 1.0], [2.0, 2.0]]), krippendorff_alpha([[1.0, 2.0], [2.0, 1.0]])
-    (1.0, -0.5)
+    Examples:
+        >>> krippendorff_alpha([[1.0, 1.0], [2.0, 2.0]]), krippendorff_alpha([[1.0, 2.0], [2.0, 1.0]])
+        (1.0, -0.5)
 
     Args:
         ratings: (n, K), a column per annotator, NaN where a rating is missing; an array or rows of numbers.

@@ -20,9 +20,10 @@ LABELS = ("item", "episode", "step")
 class RatingLog:
     """Rewards and people's ratings of them, one row per step.
 
-    >>> log = RatingLog(np.array([0.0, 4.0]), np.array([[0.1, 0.0], [-1.0, 2.0]]), episode=np.array(["a", "a"]))
-    >>> len(log), log.raters, log.place(1)
-    (2, ('rating_1', 'rating_2'), 'row 2 (episode a)')
+    Examples:
+        >>> log = RatingLog(np.array([0.0, 4.0]), np.array([[0.1, 0.0], [-1.0, 2.0]]), episode=np.array(["a", "a"]))
+        >>> len(log), log.raters, log.place(1)
+        (2, ('rating_1', 'rating_2'), 'row 2 (episode a)')
 
     Attributes:
         reward: Observed rewards, n >= 1; NaN where one is missing.
@@ -85,5 +86,17 @@ class RatingLog:
 
 
 def bad_cell(source: str, row: int, column: str, value: object, allowed: str) -> _checks.InvalidValueError:
-    """Return the error of a cell; ``row`` is counted from 0."""
+    """Return the error of a cell that holds no number.
+
+    Examples:
+        >>> str(bad_cell("log.csv", 6, "reward", "high", allowed="a number"))
+        "log.csv: row 7, column 'reward' = 'high': must be a number"
+
+    Args:
+        source: What the log is called.
+        row: Counted from 0.
+        column: Name of the column.
+        value: What the cell holds.
+        allowed: What it may hold.
+    """
     return _checks.InvalidValueError(f"{source}: row {row + 1}, column {column!r}", value, allowed)

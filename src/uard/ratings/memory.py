@@ -60,11 +60,12 @@ def _widened(feedback: Feedback, raters: int) -> Feedback:
 class FeedbackTable:
     """Feedback of state-actions by number. Changed in place; grows in rows and in raters.
 
-    >>> from uard.ratings.aggregate import aggregate
-    >>> table = FeedbackTable()
-    >>> table.observe(np.array([0, 0]), aggregate(np.array([[1.0], [3.0]]), np.zeros(2)), size=1)
-    >>> table[np.array([0])].mean.tolist()
-    [2.0]
+    Examples:
+        >>> from uard.ratings.aggregate import aggregate
+        >>> table = FeedbackTable()
+        >>> table.observe(np.array([0, 0]), aggregate(np.array([[1.0], [3.0]]), np.zeros(2)), size=1)
+        >>> table[np.array([0])].mean.tolist()
+        [2.0]
     """
 
     def __init__(self) -> None:
@@ -102,11 +103,12 @@ class FeedbackTable:
 class RatingSample:
     """A uniform sample of rated steps [Vitter 1985, algorithm R]. Changed in place.
 
-    >>> from uard.ratings.aggregate import aggregate
-    >>> sample = RatingSample(capacity=2, seed=0)
-    >>> sample.put(aggregate(np.ones((9, 1)), np.zeros(9)))
-    >>> sample.feedback().mean.tolist()
-    [1.0, 1.0]
+    Examples:
+        >>> from uard.ratings.aggregate import aggregate
+        >>> sample = RatingSample(capacity=2, seed=0)
+        >>> sample.put(aggregate(np.ones((9, 1)), np.zeros(9)))
+        >>> sample.feedback().mean.tolist()
+        [1.0, 1.0]
     """
 
     def __init__(self, capacity: int, seed: int):

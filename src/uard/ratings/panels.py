@@ -36,8 +36,9 @@ UNIFORMS = 3  # uniform numbers that an answer needs of a rater who lapses, skip
 class Rater:
     """How one simulated rater answers: scale (true + temptation (proxy - true)) + bias + noise.
 
-    >>> Rater(temptation=0.5, bias=1.0).centre(proxy=4.0, true=-1.0)
-    2.5
+    Examples:
+        >>> Rater(temptation=0.5, bias=1.0).centre(proxy=4.0, true=-1.0)
+        2.5
 
     Attributes:
         temptation: How far the rater is drawn from the truth towards the proxy, in [0, 1]; 1 repeats the proxy.
@@ -112,22 +113,23 @@ class RatingLaw(NamedTuple):
 
     Attributes:
         centre: Mean of each rater's answers, in reward units.
-        deviation: Standard deviation of each rater's answers, in reward units, >= 0.
+        deviation: Standard deviation of each rater's answers, in reward units, >= 0; broadcasts to ``centre``.
         reach: 1 where the panel can rate, 0 where nobody ever does; None if it reaches every step.
         quirks: See ``Quirks``; None where all raters are plain.
     """
 
     centre: Float[Array, "*batch K"]
-    deviation: Float[Array, "*batch K"]
+    deviation: Float[Array, "*#batch K"]
     reach: Float[Array, "*batch"] | None = None
     quirks: Quirks | None = None
 
     def at(self, *place: Any) -> RatingLaw:
         """Return the law of one state-action, or of several.
 
-        >>> law = PANELS["single"].law(np.array([4.0, 0.0]), np.array([-1.0, 0.0]), np.array([True, False]))
-        >>> law.at(0).centre.tolist()
-        [-1.0]
+        Examples:
+            >>> law = PANELS["single"].law(np.array([4.0, 0.0]), np.array([-1.0, 0.0]), np.array([True, False]))
+            >>> law.at(0).centre.tolist()
+            [-1.0]
 
         Args:
             place: One index per axis of the batch, a number or an array.
@@ -140,10 +142,11 @@ class RatingLaw(NamedTuple):
 class Panel:
     """Several raters, who are asked together.
 
-    >>> panel = Panel((Rater(), Rater(noise=1.0, stars=5)), low=-2.0, high=2.0)
-    >>> law = panel.law(proxy=np.array(1.0), true=np.array(1.0), contested=np.array(False))
-    >>> draw(law, np.random.default_rng(0)).shape
-    (2,)
+    Examples:
+        >>> panel = Panel((Rater(), Rater(noise=1.0, stars=5)), low=-2.0, high=2.0)
+        >>> law = panel.law(proxy=np.array(1.0), true=np.array(1.0), contested=np.array(False))
+        >>> draw(law, np.random.default_rng(0)).shape
+        (2,)
 
     Attributes:
         raters: At least one.
@@ -217,9 +220,10 @@ def answers(
 ) -> tuple[Float[Array, "*batch K"], Bool[Array, "*batch K"] | None]:
     """Return one rating of every rater, and which of them exist (None: all do).
 
-    >>> law = PANELS["main"].law(np.array(4.0), np.array(-1.0), np.array(True))
-    >>> answers(law, np.ones(3))[0].tolist()
-    [-0.9, 2.0, 2.0]
+    Examples:
+        >>> law = PANELS["main"].law(np.array(4.0), np.array(-1.0), np.array(True))
+        >>> answers(law, np.ones(3))[0].tolist()
+        [-0.9, 2.0, 2.0]
 
     Args:
         law: How they answer.
@@ -240,9 +244,10 @@ def answers(
 def draw(law: RatingLaw, random: np.random.Generator) -> Float[np.ndarray, "*batch K"]:
     """Return one rating of every rater as NumPy numbers, NaN where a rater did not answer.
 
-    >>> law = PANELS["colluding"].law(np.array([4.0, 0.0]), np.array([-1.0, 0.0]), np.array([True, False]))
-    >>> draw(law, np.random.default_rng(0)).tolist()
-    [[4.0, 4.0, 4.0], [0.0, 0.0, 0.0]]
+    Examples:
+        >>> law = PANELS["colluding"].law(np.array([4.0, 0.0]), np.array([-1.0, 0.0]), np.array([True, False]))
+        >>> draw(law, np.random.default_rng(0)).tolist()
+        [[4.0, 4.0, 4.0], [0.0, 0.0, 0.0]]
     """
     shape: tuple[int, ...] = law.centre.shape
     normal = random.standard_normal(shape)
@@ -269,8 +274,9 @@ PANELS: dict[str, Panel] = {"main": MAIN, "appendix": APPENDIX, "colluding": COL
 def as_panel(panel: str | Panel) -> Panel:
     """Return the panel of a name, or the panel itself.
 
-    >>> as_panel("single") is SINGLE and as_panel(SINGLE) is SINGLE
-    True
+    Examples:
+        >>> as_panel("single") is SINGLE and as_panel(SINGLE) is SINGLE
+        True
 
     Raises:
         UnknownNameError: with the nearest name.
@@ -281,7 +287,8 @@ def as_panel(panel: str | Panel) -> Panel:
 def name_of(panel: Panel) -> str:
     """Return a panel's name if it has one, else what it is.
 
-    >>> name_of(MAIN)
-    'main'
+    Examples:
+        >>> name_of(MAIN)
+        'main'
     """
     return next((name for name, other in PANELS.items() if other == panel), str(panel))

@@ -16,10 +16,11 @@ def rollout(env: Any, steps: int = 1000, seed: int = 0) -> RatingLog:
     Read from ``info``: ``ratings``, K numbers; ``sigma_m``; and ``evaluation.true_reward`` as the environments of this
     package give it. Where states and actions are whole numbers a row's item is its state-action.
 
-    >>> import gymnasium, uard.envs
-    >>> log = rollout(gymnasium.make("uard/TrapGrid6-v0", panel="main"), steps=20)
-    >>> log.ratings.shape, log.source
-    ((20, 3), 'uard/TrapGrid6-v0, 20 random steps, seed 0')
+    Examples:
+        >>> import gymnasium, uard.envs
+        >>> log = rollout(gymnasium.make("uard/TrapGrid6-v0", panel="main"), steps=20)
+        >>> log.ratings.shape, log.source
+        ((20, 3), 'uard/TrapGrid6-v0, 20 random steps, seed 0')
 
     Args:
         env: A ``gymnasium.Env``; it is not closed.

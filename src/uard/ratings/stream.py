@@ -69,13 +69,14 @@ class Observed(NamedTuple):
 class RewardStream:
     """Filters rewards as they come. Changed in place; pickling keeps all that it knows.
 
-    >>> stream = RewardStream()
-    >>> reward = [4.0] + 9 * [-0.1]  # raters contest the first and agree on the others
-    >>> ratings = [[-1.0, 2.0, 1.0]] + 9 * [[-0.1, -0.1, -0.1]]
-    >>> for _ in range(30):
-    ...     out = stream(reward, ratings, keys=range(10))
-    >>> out.weight[:2].round(2).tolist(), out.reward[:2].round(2).tolist()
-    ([0.03, 0.94], [-0.8, -0.1])
+    Examples:
+        >>> stream = RewardStream()
+        >>> reward = [4.0] + 9 * [-0.1]  # raters contest the first and agree on the others
+        >>> ratings = [[-1.0, 2.0, 1.0]] + 9 * [[-0.1, -0.1, -0.1]]
+        >>> for _ in range(30):
+        ...     out = stream(reward, ratings, keys=range(10))
+        >>> out.weight[:2].round(2).tolist(), out.reward[:2].round(2).tolist()
+        ([0.03, 0.94], [-0.8, -0.1])
 
     Attributes:
         mitigation: What is done with a reward.

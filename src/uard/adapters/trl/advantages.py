@@ -16,8 +16,9 @@ EQUAL = 1e-9  # length of a group's centred rewards at which they count as equal
 def groups_of(prompts: Sequence[Any]) -> Integer[np.ndarray, " B"]:
     """Number the groups of a batch from 0: neighbours with the same prompt, as TRL's samplers lay them out.
 
-    >>> groups_of(["why?", "why?", "how?"]).tolist()
-    [0, 0, 1]
+    Examples:
+        >>> groups_of(["why?", "why?", "how?"]).tolist()
+        [0, 0, 1]
     """
     texts = [repr(prompt) for prompt in prompts]
     return np.cumsum([i > 0 and text != texts[i - 1] for i, text in enumerate(texts)], dtype=int)
@@ -35,10 +36,13 @@ def advantage_change(
     0 where normalisation cancels the discount; if the advantages with and without it correlate by rho, it is
     sqrt(2 - 2 rho) of divided ones; 1 if only one of them is flat.
 
-    >>> raw, halved = np.array([0.0, 2.0, 0.0, 2.0]), np.array([0.0, 1.0, 0.0, 2.0])
-    >>> groups = np.array([0, 0, 1, 1])
-    >>> advantage_change(raw, halved, groups).tolist(), advantage_change(raw, halved, groups, divided=False).tolist()
-    ([0.0, 0.0], [0.5, 0.0])
+    Examples:
+        >>> raw, halved = np.array([0.0, 2.0, 0.0, 2.0]), np.array([0.0, 1.0, 0.0, 2.0])
+        >>> groups = np.array([0, 0, 1, 1])
+        >>> advantage_change(raw, halved, groups).tolist()
+        [0.0, 0.0]
+        >>> advantage_change(raw, halved, groups, divided=False).tolist()
+        [0.5, 0.0]
 
     Args:
         raw: Rewards without the discount, NaN where there is none.
@@ -61,9 +65,10 @@ def advantage_change(
 def keeps_factor(config: Any) -> bool:
     """Whether a factor that all completions of a prompt share changes their advantages under this configuration.
 
-    >>> from types import SimpleNamespace
-    >>> keeps_factor(SimpleNamespace(scale_rewards="group")), keeps_factor(SimpleNamespace(scale_rewards="batch"))
-    (False, True)
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> keeps_factor(SimpleNamespace(scale_rewards="group")), keeps_factor(SimpleNamespace(scale_rewards="batch"))
+        (False, True)
 
     Args:
         config: A GRPOConfig or RLOOConfig. GRPO divides by the group's deviation with ``scale_rewards="group"`` and
@@ -82,8 +87,9 @@ def _centred(values: Float[np.ndarray, " B"], groups: Integer[np.ndarray, " B"])
 def group_means(values: Float[np.ndarray, " B"], groups: Integer[np.ndarray, " B"]) -> Float[np.ndarray, " groups"]:
     """Mean of each group's values, without the missing ones; NaN where all are missing.
 
-    >>> group_means(np.array([1.0, 3.0, np.nan]), np.array([0, 0, 1])).tolist()
-    [2.0, nan]
+    Examples:
+        >>> group_means(np.array([1.0, 3.0, np.nan]), np.array([0, 0, 1])).tolist()
+        [2.0, nan]
     """
     total, known = np.bincount(groups, np.nan_to_num(values)), np.bincount(groups, ~np.isnan(values))
     return total / np.where(known > 0, known, np.nan)

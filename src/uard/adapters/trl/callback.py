@@ -46,12 +46,16 @@ class ReliabilityCallback(TrainerCallback):
     of judges that never disagree, and of a reward that the trainer does not call. What the reward knows is kept in
     every checkpoint and read again when training is resumed.
 
-    >>> reward = UncertaintyDiscountedReward({"length": lambda completions, **q: [len(x) for x in completions],
-    ...                                       "ums": lambda completions, **q: [-x.count("um") for x in completions]})
-    >>> callback = ReliabilityCallback(reward)  # GRPOTrainer(..., reward_funcs=reward, callbacks=[callback])
-    >>> learned = reward(["why?"] * 2, ["so", "um, so"])
-    >>> print(callback.report().splitlines()[0])
-    2 completions, 0 without any score, 0 that could not be checked; mean weight ...
+    Examples:
+        >>> def length(completions, **question):
+        ...     return [len(text) for text in completions]
+        >>> def clarity(completions, **question):
+        ...     return [-text.count("um") for text in completions]
+        >>> reward = UncertaintyDiscountedReward([length, clarity])
+        >>> callback = ReliabilityCallback(reward)  # GRPOTrainer(..., reward_funcs=reward, callbacks=[callback])
+        >>> learned = reward(["why?"] * 2, ["so", "um, so"])
+        >>> print(callback.report().splitlines()[0])
+        2 completions, 0 without any score, 0 that could not be checked; mean weight ...
 
     Attributes:
         reward: What is watched.

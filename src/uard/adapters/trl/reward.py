@@ -115,14 +115,15 @@ class UncertaintyDiscountedReward:
     Every call changes it; pickling keeps all that it knows. In distributed training each process has its own running
     scales: give ``scales`` if groups are split over processes.
 
-    >>> def length(completions, **question):
-    ...     return [len(text) for text in completions]
-    >>> def clarity(completions, **question):
-    ...     return [-text.count("um") for text in completions]
-    >>> reward = UncertaintyDiscountedReward([length, clarity])
-    >>> learned = reward(["why?"] * 3, ["so", "therefore", "um, um, therefore"])
-    >>> [f"{x:.1f}" for x in reward.last.raw], [f"{x:.1f}" for x in learned]
-    (['-0.2', '0.3', '-0.1'], ['-0.5', '0.3', '-1.3'])
+    Examples:
+        >>> def length(completions, **question):
+        ...     return [len(text) for text in completions]
+        >>> def clarity(completions, **question):
+        ...     return [-text.count("um") for text in completions]
+        >>> reward = UncertaintyDiscountedReward([length, clarity])
+        >>> learned = reward(["why?"] * 3, ["so", "therefore", "um, um, therefore"])
+        >>> [f"{x:.1f}" for x in reward.last.raw], [f"{x:.1f}" for x in learned]
+        (['-0.2', '0.3', '-0.1'], ['-0.5', '0.3', '-1.3'])
 
     Attributes:
         judges: The judges by name.

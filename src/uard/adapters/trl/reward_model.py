@@ -14,21 +14,22 @@ class RewardModel:
     It reads prompt and completion together, as TRL lets its reward models read them. With one label the score is its
     logit; a model with N labels is an ensemble of N heads and belongs into ``sigma_m``.
 
-    >>> from types import SimpleNamespace
-    >>> import torch
-    >>> class Tokenizer:  # stands for one of transformers'
-    ...     pad_token_id = 0
-    ...     def __call__(self, texts, **options):
-    ...         class Inputs(dict):
-    ...             to = lambda self, device: self
-    ...         return Inputs(ids=torch.tensor([[float(len(text))] for text in texts]))
-    >>> class Model:
-    ...     config, device = SimpleNamespace(get_text_config=SimpleNamespace), "cpu"
-    ...     eval = lambda self: self
-    ...     def __call__(self, ids):
-    ...         return SimpleNamespace(logits=ids)
-    >>> RewardModel(Model(), Tokenizer())(["2 + 2 = "], ["4"])
-    [9.0]
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> import torch
+        >>> class Tokenizer:  # stands for one of transformers'
+        ...     pad_token_id = 0
+        ...     def __call__(self, texts, **options):
+        ...         class Inputs(dict):
+        ...             to = lambda self, device: self
+        ...         return Inputs(ids=torch.tensor([[float(len(text))] for text in texts]))
+        >>> class Model:
+        ...     config, device = SimpleNamespace(get_text_config=SimpleNamespace), "cpu"
+        ...     eval = lambda self: self
+        ...     def __call__(self, ids):
+        ...         return SimpleNamespace(logits=ids)
+        >>> RewardModel(Model(), Tokenizer())(["2 + 2 = "], ["4"])
+        [9.0]
 
     Attributes:
         model: The model; it stays on the device where it is.

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 class Raw(Mitigation):
     """Learn from the observed reward: no mitigation.
 
-    >>> from uard.ratings.stream import RewardStream
-    >>> RewardStream(Raw())([4.0], [[-1.0, 2.0, 1.0]]).reward.tolist()
-    [4.0]
+    Examples:
+        >>> from uard.ratings.stream import RewardStream
+        >>> RewardStream(Raw())([4.0], [[-1.0, 2.0, 1.0]]).reward.tolist()
+        [4.0]
     """
 
     reads_feedback: ClassVar[bool] = False
@@ -41,9 +42,10 @@ Statistic = Literal["mean", "lowest", "bound"]
 class RatedReward(Mitigation):
     """Learn from a statistic of the ratings (its running mean) instead of the observed reward.
 
-    >>> from uard.ratings.stream import RewardStream
-    >>> RewardStream(RatedReward("lowest"))([4.0], [[-1.0, 2.0, 1.0]]).reward.tolist()
-    [-1.0]
+    Examples:
+        >>> from uard.ratings.stream import RewardStream
+        >>> RewardStream(RatedReward("lowest"))([4.0], [[-1.0, 2.0, 1.0]]).reward.tolist()
+        [-1.0]
 
     Attributes:
         statistic: ``mean`` or ``lowest`` of the ratings, or ``bound``: mean - k sigma over the ratings and the
@@ -91,14 +93,15 @@ class Screening(Mitigation):
 
     The hard form of the filter: w in {0, 1}, and a step with w = 0 is skipped.
 
-    >>> import numpy as np
-    >>> from uard.ratings.aggregate import aggregate
-    >>> reward = np.array([4.0, 0.0])
-    >>> feedback = aggregate(np.array([[-1.0, 1.0], [0.0, 0.0]]), reward)
-    >>> mitigation = Screening(limit=0.5)
-    >>> statistics = mitigation.fit(feedback, feedback.count > 0)
-    >>> mitigation.signal(Evidence(reward, np.zeros(2), feedback), statistics).sample_weight.tolist()
-    [0.0, 1.0]
+    Examples:
+        >>> import numpy as np
+        >>> from uard.ratings.aggregate import aggregate
+        >>> reward = np.array([4.0, 0.0])
+        >>> feedback = aggregate(np.array([[-1.0, 1.0], [0.0, 0.0]]), reward)
+        >>> mitigation = Screening(limit=0.5)
+        >>> statistics = mitigation.fit(feedback, feedback.count > 0)
+        >>> mitigation.signal(Evidence(reward, np.zeros(2), feedback), statistics).sample_weight.tolist()
+        [0.0, 1.0]
 
     Attributes:
         limit: Largest sigma_h (proxy counted as a rater) that is still learned from, in units of the reward's

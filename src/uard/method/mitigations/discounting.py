@@ -24,11 +24,12 @@ _MAD_FLOOR = 0.01  # of the reward's scale: raters who agree to within this are 
 class RewardDiscounting(Mitigation):
     """Uncertainty-Aware Reward Discounting in all its forms; ``uard`` and ``uard_paper`` name two.
 
-    >>> from uard.ratings.stream import RewardStream
-    >>> as_printed = RewardDiscounting(anchor="zero", kappa=0.0, proxy_is_rater=False, standardise=False)
-    >>> step = RewardStream(as_printed)([4.0], [[-1.0, 2.0, 1.0]])
-    >>> step.weight.round(3).tolist(), step.reward.round(3).tolist()
-    ([0.445], [1.78])
+    Examples:
+        >>> from uard.ratings.stream import RewardStream
+        >>> as_printed = RewardDiscounting(anchor="zero", kappa=0.0, proxy_is_rater=False, standardise=False)
+        >>> step = RewardStream(as_printed)([4.0], [[-1.0, 2.0, 1.0]])
+        >>> step.weight.round(3).tolist(), step.reward.round(3).tolist()
+        ([0.445], [1.78])
 
     Attributes:
         filter: Weights and parameters of the Reliability Filter.
@@ -172,8 +173,9 @@ def uard(lam: float = 0.2, alpha: float = 0.5, beta: float = 0.5, **changes: Any
     The base lambda is a tenth of the paper's and the gain kappa makes up for it where disagreement stands out: noise
     that all ratings share is then no reason for doubt.
 
-    >>> uard().anchor, uard(kappa=0.0).filter.lam
-    ('lowest', 0.2)
+    Examples:
+        >>> uard().anchor, uard(kappa=0.0).filter.lam
+        ('lowest', 0.2)
 
     Args:
         lam: lambda of the filter, >= 0.
@@ -192,8 +194,9 @@ def uard_paper(
 ) -> RewardDiscounting:
     """As printed: raw reward, act on J, ordinary backup (A19, A38).
 
-    >>> uard_paper().acts_on, uard_paper(acts_on="reward").acts_on
-    ('score', 'reward')
+    Examples:
+        >>> uard_paper().acts_on, uard_paper(acts_on="reward").acts_on
+        ('score', 'reward')
 
     Args:
         lam: lambda of the filter, >= 0.

@@ -20,23 +20,25 @@ class PanelStatistics(NamedTuple):
         disagreement: Location and mean absolute deviation of sigma_h.
         scale: Standard deviation of the observed reward, the unit in which sigmas are measured; 1 before any rating
             and while all observed rewards are equal.
-        lowest: Mean of the lowest ratings: what a step is worth at least; 0 before any rating.
+        lowest: Mean of the lowest ratings: what a step is worth at least; 0 before any rating. A model of ratings has
+            a number for each step.
     """
 
     disagreement: uncertainty.Location
     scale: Float[Array, ""] | float
-    lowest: Float[Array, ""] | float
+    lowest: Float[Array, "*batch"] | float
 
 
 def fit(feedback: Feedback, rated: Bool[Array, "*batch"], proxy_is_rater: bool) -> PanelStatistics:
     """Measure them.
 
-    >>> import numpy as np
-    >>> from uard.ratings.aggregate import aggregate
-    >>> feedback = aggregate(np.array([[-1.0, 1.0], [2.0, 4.0]]), np.array([0.0, 4.0]))
-    >>> statistics = fit(feedback, feedback.count > 0, proxy_is_rater=False)
-    >>> float(statistics.disagreement.location), float(statistics.scale), float(statistics.lowest)
-    (1.0, 2.0, 0.5)
+    Examples:
+        >>> import numpy as np
+        >>> from uard.ratings.aggregate import aggregate
+        >>> feedback = aggregate(np.array([[-1.0, 1.0], [2.0, 4.0]]), np.array([0.0, 4.0]))
+        >>> statistics = fit(feedback, feedback.count > 0, proxy_is_rater=False)
+        >>> float(statistics.disagreement.location), float(statistics.scale), float(statistics.lowest)
+        (1.0, 2.0, 0.5)
 
     Args:
         feedback: Of every state-action.

@@ -71,15 +71,16 @@ class Mitigation(ABC):
 
     A user's own is one small class:
 
-    >>> from dataclasses import dataclass
-    >>> @dataclass(frozen=True)
-    ... class Halve(Mitigation):
-    ...     factor: float = 0.5
-    ...     def signal(self, evidence, statistics):
-    ...         return LearningSignal(self.factor * evidence.reward, 1.0)
-    >>> from uard.ratings.stream import RewardStream
-    >>> RewardStream(Halve())([4.0]).reward.tolist()
-    [2.0]
+    Examples:
+        >>> from dataclasses import dataclass
+        >>> @dataclass(frozen=True)
+        ... class Halve(Mitigation):
+        ...     factor: float = 0.5
+        ...     def signal(self, evidence, statistics):
+        ...         return LearningSignal(self.factor * evidence.reward, 1.0)
+        >>> from uard.ratings.stream import RewardStream
+        >>> RewardStream(Halve())([4.0]).reward.tolist()
+        [2.0]
 
     Attributes:
         reads_feedback: Whether ratings are used at all; if not, none are drawn.

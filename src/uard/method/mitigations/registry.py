@@ -34,10 +34,11 @@ NAMED: dict[str, Callable[..., Mitigation]] = {
 def named(name: str, **parameters: Any) -> Mitigation:
     """Return the mitigation of that name, ours or a plugin's (``uard.plugins``), with some parameters changed.
 
-    >>> named("worst-of-annotations")
-    RatedReward(statistic='lowest', k=1.0, unrated_weight=1.0)
-    >>> named("uard", kappa=0.0).kappa
-    0.0
+    Examples:
+        >>> named("worst-of-annotations")
+        RatedReward(statistic='lowest', k=1.0, unrated_weight=1.0)
+        >>> named("uard", kappa=0.0).kappa
+        0.0
 
     Args:
         name: One of ``NAMED``, or what an installed package calls its own.
@@ -55,7 +56,8 @@ def named(name: str, **parameters: Any) -> Mitigation:
 def is_mitigation(value: object) -> bool:
     """Whether ``value`` is a mitigation.
 
-    >>> is_mitigation(named("raw")), is_mitigation("raw")
-    (True, False)
+    Examples:
+        >>> is_mitigation(named("raw")), is_mitigation("raw")
+        (True, False)
     """
     return isinstance(value, Mitigation)

@@ -40,13 +40,14 @@ FORMATS: dict[str, Callable[[Path, Wanted], dict[str, Any]]] = {
 def read(path: str | Path, reward: str = "reward", ratings: Sequence[str] | None = None) -> RatingLog:
     r"""Read a log from a file.
 
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     file = Path(folder) / "log.csv"
-    ...     _ = file.write_text("reward,rating_ann,rating_bob\n4,-1,\n0,0,0.1\n")
-    ...     log = read(file)
-    >>> log.raters, log.ratings.tolist()
-    (('rating_ann', 'rating_bob'), [[-1.0, nan], [0.0, 0.1]])
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder) / "log.csv"
+        ...     _ = file.write_text("reward,rating_ann,rating_bob\n4,-1,\n0,0,0.1\n")
+        ...     log = read(file)
+        >>> log.raters, log.ratings.tolist()
+        (('rating_ann', 'rating_bob'), [[-1.0, nan], [0.0, 0.1]])
 
     Args:
         path: A ``.csv`` (or ``.tsv``), ``.jsonl`` (or ``.ndjson``) or ``.parquet`` file. Text is UTF-8; a CSV is
@@ -80,8 +81,9 @@ def from_columns(
 ) -> RatingLog:
     """Take a log from named columns: a dict of lists or arrays, or a pandas data frame.
 
-    >>> from_columns({"reward": [4.0, 0.0], "rating_ann": [-1.0, None]}).ratings.tolist()
-    [[-1.0], [nan]]
+    Examples:
+        >>> from_columns({"reward": [4.0, 0.0], "rating_ann": [-1.0, None]}).ratings.tolist()
+        [[-1.0], [nan]]
 
     Args:
         columns: Name to column; None and NaN mean that a number is missing.
