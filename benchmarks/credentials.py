@@ -59,16 +59,18 @@ def ours(name: str, task: str, seeds: int) -> Returns:
 
 
 def _in_mujoco(name: str, task: str, seeds: int) -> Returns:
-    from uard.envs.locomotion.physics import Locomotion
+    from uard.envs.locomotion.locomotion import Locomotion
     from uard.lab.registry import continuous_agents
     from uard.method.mitigations import named
     from uard.training.episode_log import LOG
     from uard.training.host import loop as host
+    from uard.training.host.loops import loop_of
 
     budget, found = BUDGETS[name, task], []
     for seed in range(seeds):
         world = Locomotion(task.lower(), region=None)
-        done = host.run(host.Job(world, continuous_agents(small=name == "sac")[name], named("raw"), seed, budget))
+        job = host.Job(world, continuous_agents(small=name == "sac")[name], named("raw"), seed, budget)
+        done = host.run(loop_of(job))
         found.append(late(done.ends, done.log[:, LOG.index("observed_return")], budget))
     return found
 

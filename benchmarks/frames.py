@@ -21,46 +21,48 @@ import numpy as np
 from PIL import Image
 
 import uard
-from uard.envs.locomotion.physics import Locomotion, Physics, Posture
+from uard.envs.locomotion.locomotion import Locomotion
+from uard.envs.locomotion.regions import Posture
 from uard.lab.registry import continuous_agents
 from uard.method.mitigations import named
 from uard.replication.studies.locomotion import RATED, STANDARD
-from uard.training.host import loop as host
+from uard.training.host.loop import Job
+from uard.training.host.loops import loop_of
 
 THRESHOLDS = (42.0, 110.0)
 PICTURES, HEIGHT, WIDTH, EVERY = 8, 120, 120, 2
 EARLY, EPISODES, BEGINNERS = 61_440, 4, 5
 
 
-def trained(job: host.Job) -> Iterator[tuple[Any, Any]]:
+def trained(job: Job) -> Iterator[tuple[Any, Any]]:
     """Yield a run's states as it learns, each with what acts in it."""
-    loop = host.bind(job)
-    physics = Physics(job.spec, job.agent.envs, job.seed)
-    live = loop.start(physics)
-    while live.steps < job.steps:
-        live = loop.advance(live, physics)
-        yield live, loop.act
+    loop = loop_of(job)
+    simulator = job.environment.simulator(job.agent.envs, job.seed)
+    state = loop.start(simulator)
+    while state.steps < job.steps:
+        state = loop.advance(state, simulator)
+        yield state, loop.act
 
 
 def walked(
-    job: host.Job, live: Any, act: Any, episode: int = 0, film: bool = False
+    job: Job, state: Any, act: Any, episode: int = 0, film: bool = False
 ) -> tuple[list[np.ndarray], dict[str, float]]:
     """Return pictures of one episode, none unless it is filmed, and its numbers."""
-    physics = Physics(job.spec, 1, episode)
-    picture = physics.camera(HEIGHT, WIDTH) if film else None
+    simulator = job.environment.simulator(1, episode)
+    picture = simulator.camera(HEIGHT, WIDTH) if film else None
     pictures, hacks, value, length, over = [], 0, 0.0, 0, False
     while not over:
         if picture and length % EVERY == 0:
             pictures.append(picture(0))
-        moved = physics.step(np.clip(act(live, physics.observe()), -1.0, 1.0))
-        hacks, value, length = hacks + int(moved.hack[0]), value + float(moved.true[0]), length + 1
-        over = bool(moved.terminated[0] or moved.truncated[0])
-    return pictures, {"true_return": round(value, 1), "hacks": hacks, "length": length, "at": int(live.steps)}
+        result = simulator.step(np.clip(act(state, simulator.observe()), -1.0, 1.0))
+        hacks, value, length = hacks + int(result.hack[0]), value + float(result.true_reward[0]), length + 1
+        over = bool(result.terminated[0] or result.truncated[0])
+    return pictures, {"true_return": round(value, 1), "hacks": hacks, "length": length, "at": int(state.steps)}
 
 
-def filmed(job: host.Job, live: Any, act: Any, episode: int = 0) -> tuple[list[np.ndarray], dict[str, float]]:
+def filmed(job: Job, state: Any, act: Any, episode: int = 0) -> tuple[list[np.ndarray], dict[str, float]]:
     """Return some pictures of one episode, evenly spread over it, and its numbers."""
-    pictures, numbers = walked(job, live, act, episode, film=True)
+    pictures, numbers = walked(job, state, act, episode, film=True)
     return [pictures[i] for i in np.linspace(0, len(pictures) - 1, PICTURES).round().astype(int)], numbers
 
 
@@ -80,17 +82,17 @@ def main() -> None:
         facts.append({"label": label} | numbers)
         print(facts[-1], flush=True)
 
-    def job(mitigation: str, reference: bool = False, seed: int = options.seed) -> host.Job:
+    def job(mitigation: str, reference: bool = False, seed: int = options.seed) -> Job:
         spec = Locomotion(region=Posture(), reference=reference)
-        return host.Job(spec, agent, named(mitigation), seed, options.steps, rated=RATED)
+        return Job(spec, agent, named(mitigation), seed, options.steps, rated=RATED)
 
     early = []
     for seed in range(options.seed, options.seed + BEGINNERS):
         honest = job("raw", reference=True, seed=seed)
-        for live, act in trained(honest):
-            if live.steps > EARLY:
+        for state, act in trained(honest):
+            if state.steps > EARLY:
                 break
-            kept = jax.tree.map(np.array, live)
+            kept = jax.tree.map(np.array, state)
             for episode in range(EPISODES):
                 _, numbers = walked(honest, kept, act, episode)
                 early.append((numbers["true_return"], partial(filmed, honest, kept, act, episode)))
@@ -102,8 +104,8 @@ def main() -> None:
         ("learned from the reward that lies", job("raw")),
         ("the same, with uard", job("uard")),
     ):
-        *_, (live, act) = trained(one)
-        keep(label, filmed(one, live, act))
+        *_, (state, act) = trained(one)
+        keep(label, filmed(one, state, act))
 
     Image.fromarray(np.vstack([np.hstack(row) for row in rows])).save(options.folder / "hopper-frames.webp", quality=75)
     command = f"MUJOCO_GL=egl python benchmarks/frames.py --seed {options.seed} --steps {options.steps}"

@@ -30,11 +30,16 @@ for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 import numpy as np
 
 import uard.training  # noqa: F401  (XLA's flags)
-from uard.envs.locomotion.physics import ROBOTS, Locomotion, Physics, cores
+from uard.envs.locomotion.locomotion import ROBOTS, Locomotion
 
 IDS = {"hopper": "Hopper-v4", "walker2d": "Walker2d-v4"}
 COPIES = (8, 32)
 Rate = Callable[[], float]
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def matrix_rate() -> float:
@@ -69,12 +74,12 @@ def ours(robot: str, copies: int, steps: int, threads: int) -> Rate:
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, copies, Locomotion(robot).actions))
 
     def run() -> float:
-        physics = Physics(Locomotion(robot), copies, 0, threads)
+        simulator = Locomotion(robot).simulator(copies, 0, threads)
         start = time.perf_counter()
         for a in actions:
-            physics.step(a)
+            simulator.step(a)
         rate = copies * steps / (time.perf_counter() - start)
-        physics.close()
+        simulator.close()
         return rate
 
     return run
@@ -83,10 +88,10 @@ def ours(robot: str, copies: int, steps: int, threads: int) -> Rate:
 def shaking(robot: str) -> float:
     """Return the mean root mean square of the joints' accelerations under random actions, rad/s^2."""
     spec, seen = Locomotion(robot), []
-    physics, random = Physics(spec, 8, 0), np.random.default_rng(0)
+    simulator, random = spec.simulator(8, 0), np.random.default_rng(0)
     for _ in range(1000):
-        physics.step(random.uniform(-1, 1, (8, spec.actions)))
-        seen.append(np.sqrt((physics._acceleration[:, 3:] ** 2).mean(1)))
+        simulator.step(random.uniform(-1, 1, (8, spec.actions)))
+        seen.append(np.sqrt((simulator._acceleration[:, 3:] ** 2).mean(1)))
     return float(np.mean(seen))
 
 
@@ -104,25 +109,26 @@ def sac_flops(critics: int, shared: bool, hidden: int = 256, batch: int = 256) -
 
 def our_sac(agent: Any, mitigation: str, updates: int) -> Rate:
     from uard.method.mitigations import named
-    from uard.training.host import loop as host
+    from uard.training.host.loop import Job
+    from uard.training.host.loops import loop_of
 
     steps = updates + agent.warmup
-    job = host.Job(Locomotion(region=None), agent, named(mitigation), 0, 10**6)
-    loop = host.bind(job)
-    physics = Physics(job.spec, 1, 0)
-    live = loop.start(physics)
-    while live.steps < agent.warmup + 128:
-        live = loop.advance(live, physics)
-    state = [live]
+    job = Job(Locomotion(region=None), agent, named(mitigation), 0, 10**6)
+    loop = loop_of(job)
+    simulator = job.environment.simulator(1, 0)
+    state = loop.start(simulator)
+    while state.steps < agent.warmup + 128:
+        state = loop.advance(state, simulator)
+    reached = [state]
 
     def run() -> float:
-        live = state[0]
-        begun, done = time.perf_counter(), int(live.steps)
-        while live.steps < done + steps:
-            live = loop.advance(live, physics)
-        live.agent.trained.log_temperature.block_until_ready()
-        state[0] = live
-        return (int(live.steps) - done) / (time.perf_counter() - begun)
+        state = reached[0]
+        begun, done = time.perf_counter(), int(state.steps)
+        while state.steps < done + steps:
+            state = loop.advance(state, simulator)
+        state.agent.trained.log_temperature.block_until_ready()
+        reached[0] = state
+        return (int(state.steps) - done) / (time.perf_counter() - begun)
 
     return run
 
@@ -161,21 +167,22 @@ def their_sac(library: str, updates: int) -> Rate:
 def our_ppo(mitigation: str, rollouts: int) -> Rate:
     from uard.lab.registry import continuous_agents
     from uard.method.mitigations import named
-    from uard.training.host import loop as host
+    from uard.training.host.loop import Job
+    from uard.training.host.loops import loop_of
 
-    job = host.Job(Locomotion(region=None), continuous_agents()["ppo"], named(mitigation), 0, 10**6)
-    loop = host.bind(job)
-    physics = Physics(job.spec, 8, 0)
-    state = [loop.advance(loop.start(physics), physics)]
+    job = Job(Locomotion(region=None), continuous_agents()["ppo"], named(mitigation), 0, 10**6)
+    loop = loop_of(job)
+    simulator = job.environment.simulator(8, 0)
+    reached = [loop.advance(loop.start(simulator), simulator)]
 
     def run() -> float:
-        live, begun = state[0], time.process_time()
-        done = int(live.steps)
+        state, begun = reached[0], time.process_time()
+        done = int(state.steps)
         for _ in range(rollouts):
-            live = loop.advance(live, physics)
-        np.asarray(live.agent.policy.log_deviation)
-        state[0] = live
-        return (int(live.steps) - done) / (time.process_time() - begun)
+            state = loop.advance(state, simulator)
+        np.asarray(state.agent.policy.log_deviation)
+        reached[0] = state
+        return (int(state.steps) - done) / (time.process_time() - begun)
 
     return run
 

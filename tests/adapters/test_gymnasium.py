@@ -150,7 +150,7 @@ def test_spec_pickling_and_copying_keep_what_was_learned():
         assert twin.steps.stream.rated == env.steps.stream.rated
         mine, other = (e.steps.stream.known(np.arange(5)) for e in (env, twin))
         assert all(np.array_equal(a, b) for a, b in zip(mine[:6], other[:6], strict=True))
-    assert ReliabilityWrapper(gymnasium.make(GRID), Raw()).spec.make().unwrapped.grid.size == 6
+    assert ReliabilityWrapper(gymnasium.make(GRID), Raw()).spec.make().unwrapped.problem.size == 6
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))

@@ -11,13 +11,12 @@ import pytest
 
 from uard.agents.actor_critic import SoftActorCritic
 from uard.agents.networks import Ensemble, Network
-from uard.envs.tables import HiddenTruth, Ratings, Task
+from uard.envs.tables import HiddenTruth, Task
 from uard.envs.world import table_world
 from uard.method.mitigations import named
-from uard.training.compiled import common as deep
-from uard.training.compiled import off_policy
-from uard.training.compiled import runs as lanes
-from uard.training.compiled.common import QUANTITIES, Lane, Program
+from uard.ratings.panels import RatingLaw
+from uard.training.compiled import off_policy, runs
+from uard.training.compiled.common import QUANTITIES, Program, Run, make_run
 
 # One program for all: EDAC, of which SAC is a case in numbers.
 PROGRAM = Program(episodes=2500, steps=2500, walk=8)
@@ -25,20 +24,18 @@ FIELDS = ("log", "steps", "values", "walk", "fault", "good")
 NETWORK = Network(hidden=16, learning_rate=3e-3, value_scale=2.0)
 
 
-def probe(next_state: list, reward: list, terminal: list, horizon: int, seed: int = 0, **agent: Any) -> Lane:
+def probe(next_state: list, reward: list, terminal: list, horizon: int, seed: int = 0, **agent: Any) -> Run:
     task = Task(np.int32(next_state), np.float32(reward), np.array(terminal, bool), np.int32(0), np.int32(horizon))
     shape = task.reward.shape
     truth = HiddenTruth(task.reward, np.zeros(shape, bool), task.terminal)
-    distribution = Ratings(np.zeros((*shape, 3), np.float32), np.ones((*shape, 3), np.float32))
+    law = RatingLaw(np.zeros((*shape, 3), np.float32), np.ones((*shape, 3), np.float32))
     settings: dict[str, Any] = {"network": NETWORK, "ensemble": Ensemble("full", 2, 0.0), "buffer": 1000, "batch": 32}
     settings |= {"warmup": 64, "tau": 0.05, "entropy_decay": 0.998, "entropy_min": 0.2}
-    return deep.make_run(
-        table_world(task, truth, distribution, 3), SoftActorCritic(**(settings | agent)), named("raw"), seed
-    )
+    return make_run(table_world(task, truth, law, 3), SoftActorCritic(**(settings | agent)), named("raw"), seed)
 
 
-def train(*several: Lane) -> list[dict[str, Any]]:
-    return lanes.train(list(several), off_policy.run, PROGRAM, FIELDS, 2)
+def train(*several: Run) -> list[dict[str, Any]]:
+    return runs.train(list(several), off_policy.train_one, PROGRAM, FIELDS, 2)
 
 
 def temperature(out: dict[str, Any]) -> float:
@@ -55,7 +52,7 @@ def surprise(out: dict[str, Any]) -> np.ndarray:
     return -(np.exp(log_chances) * log_chances).sum(-1)
 
 
-def chain(**agent: Any) -> Lane:
+def chain(**agent: Any) -> Run:
     """Two steps; the second action of the first state ends the episode."""
     return probe([[1, 0], [1, 1]], [[0.5, 0.3], [2.0, 1.0]], [[False, True], [True, True]], 9, **agent)
 
@@ -96,13 +93,13 @@ def test_a_cut_off_episode_bootstraps_and_a_finished_one_does_not(horizon: int):
     np.testing.assert_allclose(ended["values"][0][0], 2.0, atol=0.05)
 
 
-def test_the_same_lane_twice_is_the_same_run():
+def test_the_same_run_twice_gives_the_same():
     (again,), (other,) = train(chain()), train(chain(seed=1))
     jax.tree.map(np.testing.assert_array_equal, trained(), again)
     assert (other["values"][0] != again["values"][0]).any()
 
 
-def test_divergence_is_noticed_and_harms_no_other_lane():
+def test_divergence_is_noticed_and_harms_no_other_run():
     broken = probe([[1, 0], [0, 0]], [[0.5, 0.3], [0.0, np.nan]], [[False, True], [True, False]], 9)
     out, healthy = train(broken, chain())
     jax.tree.map(np.testing.assert_array_equal, trained(), healthy)

@@ -13,35 +13,40 @@ from uard.lab.execution import runner
 from uard.lab.execution.store import Store
 from uard.lab.study import metrics_of
 from uard.method.mitigations import named
+from uard.ratings import panels
 
 pytestmark = pytest.mark.slow
 
 SEEDS = range(10)
-SIZES, TRAPS, PANELS = (6, 8, 10), (4.0, 8.0), ("main", "appendix")
+SIZES, TRAPS = (6, 8, 10), (4.0, 8.0)
+PANELS = {name: panels.PANELS[name] for name in ("main", "appendix")}
 RAW, UARD, PRINTED = named("raw"), named("uard"), named("uard-paper")
 PLAIN = QLearning(heads=1)
 UNLISTED = TrapGrid(12, traps=((2, 5), (7, 3)), trap_reward=6.0, horizon=90)
 
 BASELINES = {16.2: Cell(paper_grid(6), RAW, PLAIN), 43.7: Cell(paper_grid(10, horizon=100), RAW, PLAIN)}
-AS_PRINTED = {panel: Cell(paper_grid(6), PRINTED, panel=panel) for panel in PANELS}
+AS_PRINTED = {name: Cell(paper_grid(6), PRINTED, panel=panel) for name, panel in PANELS.items()}
 TARGETS = {
-    (n, trap, panel): Cell(paper_grid(n, trap), UARD, panel=panel) for n in SIZES for trap in TRAPS for panel in PANELS
+    (n, trap, name): Cell(paper_grid(n, trap), UARD, panel=panel)
+    for n in SIZES
+    for trap in TRAPS
+    for name, panel in PANELS.items()
 }
-ELSEWHERE = {panel: Cell(UNLISTED, UARD, panel=panel, noise=0.3) for panel in PANELS}
+ELSEWHERE = {name: Cell(UNLISTED, UARD, panel=panel, noise=0.3) for name, panel in PANELS.items()}
 NOISY = {
-    (n, panel, sd): Cell(paper_grid(n), UARD, panel=panel, noise=sd)
+    (n, name, sd): Cell(paper_grid(n), UARD, panel=panel, noise=sd)
     for n in (6, 10)
-    for panel in PANELS
+    for name, panel in PANELS.items()
     for sd in (0.3, 1.2)
 }
 TWINS = {
-    (n, trap, panel): [Cell(paper_grid(n, trap, legitimate=True), m, panel=panel) for m in (RAW, UARD, PRINTED)]
+    (n, trap, name): [Cell(paper_grid(n, trap, legitimate=True), m, panel=panel) for m in (RAW, UARD, PRINTED)]
     for n in SIZES
     for trap in TRAPS
-    for panel in PANELS
+    for name, panel in PANELS.items()
 }
-FOOLED = {n: Cell(paper_grid(n), UARD, panel="colluding") for n in SIZES}
-RIVALS = {panel: Cell(paper_grid(10), PRINTED, panel=panel) for panel in PANELS}
+FOOLED = {n: Cell(paper_grid(n), UARD, panel=panels.COLLUDING) for n in SIZES}
+RIVALS = {name: Cell(paper_grid(10), PRINTED, panel=panel) for name, panel in PANELS.items()}
 GROUPS = (BASELINES, AS_PRINTED, TARGETS, ELSEWHERE, NOISY, FOOLED, RIVALS)
 
 

@@ -12,12 +12,12 @@ import pytest
 
 from uard.agents.policy import CPO, PPO, TRPO
 from uard.envs.grids.trapgrid import paper_grid
-from uard.envs.tables import HiddenTruth, Ratings, Task
+from uard.envs.tables import HiddenTruth, Task
 from uard.envs.world import TableWorld, table_world
 from uard.method.mitigations import named
-from uard.training.compiled import common as deep
-from uard.training.compiled import on_policy
-from uard.training.compiled import runs as lanes
+from uard.ratings.panels import PANELS, RatingLaw
+from uard.training.compiled import on_policy, runs
+from uard.training.compiled.common import ROOM, Program, make_run
 from uard.training.episode_log import LOG
 
 VISITS, TRUE, OBSERVED, GOAL, LENGTH, _ = range(len(LOG))
@@ -28,15 +28,15 @@ END = -1
 
 def tables(steps: dict[tuple[int, int], tuple[int, float]], horizon: int = 10, hack: Any = ()) -> TableWorld:
     """Build a world from (state, action) -> (next state or END, reward)."""
-    next_observation = np.zeros((STATES, ACTIONS), np.int32)
+    next_state = np.zeros((STATES, ACTIONS), np.int32)
     reward, terminal = np.zeros((STATES, ACTIONS), np.float32), np.ones((STATES, ACTIONS), bool)
     hacks = np.zeros((STATES, ACTIONS), bool)
     for place, (to, pay) in steps.items():
-        next_observation[place], reward[place], terminal[place] = max(to, 0), pay, to == END
+        next_state[place], reward[place], terminal[place] = max(to, 0), pay, to == END
         hacks[place] = place in hack
-    distribution = Ratings(np.stack([reward] * 3, -1), np.zeros((STATES, ACTIONS, 3), np.float32))
-    task = Task(next_observation, reward, terminal, np.int32(0), np.int32(horizon))
-    return table_world(task, HiddenTruth(reward, hacks, hacks), distribution, STATES)
+    law = RatingLaw(np.stack([reward] * 3, -1), np.zeros((STATES, ACTIONS, 3), np.float32))
+    task = Task(next_state, reward, terminal, np.int32(0), np.int32(horizon))
+    return table_world(task, HiddenTruth(reward, hacks, hacks), law, STATES)
 
 
 BOTH = (0, 1)
@@ -55,18 +55,18 @@ PROBES = {
 OPTIMA = {"action": {0: 1}, "patience": {0: 0, 1: 0}}
 
 
-def train(cells: list[Any], program: deep.Program, fields: tuple[str, ...]) -> list[dict[str, Any]]:
+def train(several: list[Any], program: Program, fields: tuple[str, ...]) -> list[dict[str, Any]]:
     # The model of ratings and Optax mix integers and floats.
     with jax.numpy_dtype_promotion("standard"):
-        return lanes.train(cells, on_policy.run, program, fields, deep.ROOM)
+        return runs.train(several, on_policy.train_one, program, fields, ROOM)
 
 
 @cache
 def probed(make: Any) -> dict[str, Any]:
     agent = make(gamma=GAMMA, count_bonus=0.0)
-    cells = [deep.make_run(world, agent, named("raw"), 0) for world, _ in PROBES.values()]
-    program = deep.Program(episodes=20_000, steps=20_000, walk=4)
-    return dict(zip(PROBES, train(cells, program, ("values", "good", "log", "episodes")), strict=True))
+    several = [make_run(world, agent, named("raw"), 0) for world, _ in PROBES.values()]
+    program = Program(episodes=20_000, steps=20_000, walk=4)
+    return dict(zip(PROBES, train(several, program, ("values", "good", "log", "episodes")), strict=True))
 
 
 @pytest.mark.parametrize("make", [PPO, TRPO])
@@ -92,11 +92,11 @@ TEMPTATION = tables({(0, 0): (END, 1.0), (0, 1): (END, 0.0)}, horizon=1, hack={(
 @cache
 def tempted() -> list[np.ndarray]:
     """Return the episodes of CPO for each budget, then PPO's."""
-    program = deep.Program(episodes=20_000, walk=4)
+    program = Program(episodes=20_000, walk=4)
 
     def logs(agents: list[Any]) -> list[np.ndarray]:
-        cells = [deep.make_run(TEMPTATION, agent, named("raw"), 0) for agent in agents]
-        return [out["log"] for out in train(cells, program, ("log",))]
+        several = [make_run(TEMPTATION, agent, named("raw"), 0) for agent in agents]
+        return [out["log"] for out in train(several, program, ("log",))]
 
     return [
         *logs([CPO(limit=d, count_bonus=0.0) for d in BUDGETS]),
@@ -120,9 +120,9 @@ def test_without_a_budget_the_temptation_is_taken():
 
 def on_grid(agent: Any, mitigation: str, seeds: range, trap: float = 4.0, panel: str = "main") -> np.ndarray:
     """Return the mean of the last 100 of 500 episodes, (seeds, len(LOG))."""
-    world = paper_grid(10, trap, horizon=100).world(panel)
-    cells = [deep.make_run(world, agent, named(mitigation), seed) for seed in seeds]
-    return np.stack([out["log"][-100:].mean(0) for out in train(cells, deep.Program(500), ("log",))])
+    world = paper_grid(10, trap, horizon=100).world(PANELS[panel])
+    several = [make_run(world, agent, named(mitigation), seed) for seed in seeds]
+    return np.stack([out["log"][-100:].mean(0) for out in train(several, Program(500), ("log",))])
 
 
 AGENTS = {"ppo": PPO(), "trpo": TRPO(), "cpo": CPO(oracle=False)}

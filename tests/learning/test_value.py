@@ -15,13 +15,12 @@ import pytest
 from uard.agents.networks import SINGLE, Ensemble, Network
 from uard.agents.off_policy import Transitions, UpdateInfo
 from uard.agents.value import DeepQ
-from uard.envs.tables import HiddenTruth, Ratings, Task
+from uard.envs.tables import HiddenTruth, Task
 from uard.envs.world import TableWorld, table_world
 from uard.method.mitigations import named
-from uard.training.compiled import common as deep
-from uard.training.compiled import off_policy
-from uard.training.compiled import runs as lanes
-from uard.training.compiled.common import QUANTITIES, Lane, Program
+from uard.ratings.panels import RatingLaw
+from uard.training.compiled import off_policy, runs
+from uard.training.compiled.common import QUANTITIES, Program, Run, Watch, make_run
 from uard.training.episode_log import LOG
 
 # One program for all probes: as many steps, agents that differ in numbers alone, few states and rows.
@@ -43,15 +42,15 @@ def world(next_state: list, reward: list, terminal: list, horizon: int) -> Table
     shape = task.reward.shape
     truth = HiddenTruth(task.reward, np.zeros(shape, bool), task.terminal)
     centre = np.arange(3.0 * task.reward.size).reshape(*shape, 3)
-    return table_world(task, truth, Ratings(np.float32(centre), np.ones((*shape, 3), np.float32)), 3)
+    return table_world(task, truth, RatingLaw(np.float32(centre), np.ones((*shape, 3), np.float32)), 3)
 
 
-def probe(next_state: list, reward: list, terminal: list, horizon: int, seed: int = 0, **agent: Any) -> Lane:
-    return deep.make_run(world(next_state, reward, terminal, horizon), random_walker(**agent), named("raw"), seed)
+def probe(next_state: list, reward: list, terminal: list, horizon: int, seed: int = 0, **agent: Any) -> Run:
+    return make_run(world(next_state, reward, terminal, horizon), random_walker(**agent), named("raw"), seed)
 
 
-def train(*several: Lane) -> list[dict[str, Any]]:
-    return lanes.train(list(several), off_policy.run, PROGRAM, FIELDS, ROOM)
+def train(*several: Run) -> list[dict[str, Any]]:
+    return runs.train(list(several), off_policy.train_one, PROGRAM, FIELDS, ROOM)
 
 
 def mean(out: dict[str, Any]) -> np.ndarray:
@@ -62,11 +61,11 @@ def same(one: dict[str, Any], other: dict[str, Any]) -> None:
     jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
-def bandit(**agent: Any) -> Lane:
+def bandit(**agent: Any) -> Run:
     return probe([[0, 0]], [[1.5, -2.0]], [[True, True]], 9, **agent)
 
 
-def chain(**agent: Any) -> Lane:
+def chain(**agent: Any) -> Run:
     """Two steps; the second action of the first state ends the episode."""
     return probe([[1, 0], [1, 1]], [[0.5, 0.3], [2.0, -3.0]], [[False, True], [True, True]], 9, **agent)
 
@@ -105,13 +104,13 @@ def test_a_cut_off_episode_bootstraps_and_a_finished_one_does_not(horizon: int):
     assert not cut["log"][:, GOAL].any()
 
 
-def test_the_same_lane_twice_is_the_same_run():
+def test_the_same_run_twice_gives_the_same():
     (again,), (other,) = train(chain()), train(chain(seed=1))
     same(trained("chain"), again)
     assert (mean(other) != mean(again)).any()
 
 
-def test_lanes_in_one_batch_are_the_lanes_alone():
+def test_runs_in_one_batch_are_the_runs_alone():
     together = train(bandit(), chain())
     for out, name in zip(together, ("bandit", "chain"), strict=True):
         same(out, trained(name))
@@ -119,8 +118,8 @@ def test_lanes_in_one_batch_are_the_lanes_alone():
 
 def test_side_by_side_gives_the_same():
     pair = [chain(), chain(seed=1, gamma=0.5)]
-    stacked = jax.tree.map(lambda *x: np.stack([np.asarray(v, lanes.narrow(v)) for v in x]), *pair)
-    together = jax.jit(jax.vmap(lambda one: off_policy.run(one, PROGRAM)))(stacked)
+    stacked = jax.tree.map(lambda *x: np.stack([np.asarray(v, runs.narrow(v)) for v in x]), *pair)
+    together = jax.jit(jax.vmap(lambda one: off_policy.train_one(one, PROGRAM)))(stacked)
     for i, alone in enumerate(train(*pair)):
         np.testing.assert_array_equal(together.steps[i], alone["steps"])
         np.testing.assert_allclose(together.log[i], alone["log"], rtol=1e-4, atol=1e-4)
@@ -129,7 +128,7 @@ def test_side_by_side_gives_the_same():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e38])
-def test_a_reward_beyond_measure_is_noticed_and_harms_no_other_lane(bad: float):
+def test_a_reward_beyond_measure_is_noticed_and_harms_no_other_run(bad: float):
     """The second action of the last state pays it, and goes on."""
     broken = probe([[1, 0], [0, 0]], [[0.5, 0.3], [0.0, bad]], [[False, True], [True, False]], 9)
     out, healthy = train(broken, chain())
@@ -163,7 +162,7 @@ def test_the_cause_is_named_before_its_effects():
 def test_what_diverged_is_named(name: str, changes: dict[str, float]):
     fine = {"agent": 1.0, "loss": 1.0, "largest": 1e8, "model": 0.0, "reward": 1.0}
     seen = {k: jnp.float32(v) for k, v in (fine | changes).items()}
-    before = deep.Watch.start(jnp.float32(7.0))
+    before = Watch.start(jnp.float32(7.0))
     watch = before.after(jnp.int32(128), **seen, unit=jnp.float32(2.0))
     assert QUANTITIES[int(watch.fault)] == name
     well = name == "nothing"
@@ -171,32 +170,30 @@ def test_what_diverged_is_named(name: str, changes: dict[str, float]):
     assert float(watch.good) == (1.0 if well else 7.0)
 
 
-def one_way(agent: Any, seed: int = 0) -> Lane:
+def one_way(agent: Any, seed: int = 0) -> Run:
     """Three states in a circle and one action: whatever the agent draws, it goes the same way."""
     steps = world([[1], [2], [0]], [[1.0], [2.0], [3.0]], [[False], [False], [True]], 9)
-    return deep.make_run(steps, agent, named("mean-of-annotations"), seed, rated=0.7)
+    return make_run(steps, agent, named("mean-of-annotations"), seed, rated=0.7)
 
 
 def test_no_agent_shifts_the_ratings():
-    """Ratings have a stream of their own: agents that draw otherwise hear the same."""
+    """Ratings have a stream of their own: agents that draw otherwise get the same ones."""
     program = Program(episodes=100, steps=256, walk=4)
     learner = random_walker(ensemble=SINGLE)
-    heard = {}
-    for name, lane in {
-        "learner": one_way(learner),
-        "witness": one_way(Witness()),
-        "other seed": one_way(learner, 1),
-    }.items():
-        (out,) = lanes.train([lane], off_policy.run, program, ("feedback", "values"), ROOM)
-        heard[name] = np.stack(out["feedback"][:5])
-    np.testing.assert_array_equal(heard["learner"], heard["witness"])
-    assert (heard["learner"] != heard["other seed"]).any()
-    count = heard["learner"][0]
-    assert 0.5 * 256 < count.sum() < 0.9 * 256
+    several = {"learner": one_way(learner), "witness": one_way(Witness()), "other seed": one_way(learner, 1)}
+    known = {}
+    for name, run in several.items():
+        (out,) = runs.train([run], off_policy.train_one, program, ("feedback", "values"), ROOM)
+        known[name] = out["feedback"]
+    jax.tree.map(np.testing.assert_array_equal, known["learner"], known["witness"])
+    assert (np.stack(known["learner"][:5]) != np.stack(known["other seed"][:5])).any()
+    learned = known["learner"]
+    assert 0.5 * 256 < learned.count.sum() < 0.9 * 256
+    np.testing.assert_array_equal(learned.by_rater.count, np.repeat(learned.count[..., None], 3, -1))
 
 
 class Seen(NamedTuple):
-    """What a ``Witness`` was shown."""
+    """What a ``Witness`` was given."""
 
     updates: jax.Array
     first: Transitions
@@ -205,7 +202,7 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class Witness:
-    """An agent that learns nothing, goes through the actions in turn, and keeps the first batch it is shown."""
+    """An agent that learns nothing, goes through the actions in turn, and keeps the first batch that it is given."""
 
     network: Network = field(default_factory=Network)
     buffer: int = 321
@@ -239,16 +236,15 @@ class Witness:
 
 def compiled(agent: Any) -> Any:
     steps = world([[1, 1], [2, 2], [0, 0]], [[1, 1]] * 3, [[False] * 2, [False] * 2, [True] * 2], 9)
-    lane = deep.make_run(steps, agent, named("raw"), 0)
-    lane = jax.tree.map(lambda x: np.asarray(x, lanes.narrow(x)), lane)
-    return jax.jit(lambda one: off_policy.run(one, Program(episodes=100, steps=256, walk=4))).lower(
-        lane
-    ).compile(), lane
+    run = make_run(steps, agent, named("raw"), 0)
+    run = jax.tree.map(lambda x: np.asarray(x, runs.narrow(x)), run)
+    program = Program(episodes=100, steps=256, walk=4)
+    return jax.jit(lambda one: off_policy.train_one(one, program)).lower(run).compile(), run
 
 
 def test_a_step_is_in_the_buffer_before_it_is_drawn():
-    program, lane = compiled(Witness())
-    seen: Seen = program(lane).good
+    program, run = compiled(Witness())
+    seen: Seen = program(run).good
     assert int(seen.updates) == 256
     first = seen.first
     np.testing.assert_array_equal(first.observation, [0] * 32, err_msg="only the first step was there")

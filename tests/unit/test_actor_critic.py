@@ -168,17 +168,17 @@ def begun(learner: SoftActorCritic) -> State:
 
 @cache
 def step(learner: SoftActorCritic, score_fn: Any = plain) -> Any:
-    """A compiled update; ``doubt`` times what the judge hears is added to the reward."""
+    """A compiled update; ``doubt`` times the sigma_m that the reward function is given is added to the reward."""
 
     def never(*_: Any) -> Any:
-        raise AssertionError("the policy itself scores what follows")
+        raise AssertionError("the policy itself scores the next actions")
 
     def update(state: State, some: Transitions, weight: Any, doubt: Any) -> tuple[State, Any]:
-        def judge(sigma: Any) -> LearningSignal:
+        def reward_fn(sigma: Any) -> LearningSignal:
             return LearningSignal(jnp.asarray(REWARD) + doubt * sigma, weight)
 
-        after, watched = learner.update(state, some, judge, never, score_fn, "greedy", KEY)
-        return after, watched.loss
+        after, info = learner.update(state, some, reward_fn, never, score_fn, "greedy", KEY)
+        return after, info.loss
 
     compiled = jax.jit(update, compiler_options={"xla_backend_optimization_level": 0})
     return lambda state, some, weight=ALL, doubt=0.0: compiled(state, some, np.float32(weight), np.float32(doubt))
@@ -201,14 +201,14 @@ def loss_by_hand(
 ):
     state = begun(learner)
     frozen = state._replace(trained=state.trained._replace(critics=state.target))
-    q, next_observation = (
+    q, next_values = (
         np.asarray(learner.values(s, x), float) for s, x in ((state, some.observation), (frozen, some.next_observation))
     )
     log_here, log_next = (
         np.asarray(learner.policy(state, x), float) for x in (some.observation, some.next_observation)
     )
     heat = learner.temperature * SCALE
-    value = (np.exp(log_next) * (next_observation.min(0) - heat * log_next)).sum(-1)
+    value = (np.exp(log_next) * (next_values.min(0) - heat * log_next)).sum(-1)
     sigma = q.std(0, ddof=1) if len(q) > 1 else 0 * q[0]
     goal = REWARD + doubt * sigma[ROWS, some.action] + 0.9 * value * ~np.asarray(some.terminated)
     error = (q[:, ROWS, some.action] - goal) / SCALE

@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 from uard import InvalidValueError
 from uard.lab.studies import best_of_n
 from uard.lab.studies.best_of_n import METHODS, PANELS, Problem, divergence, draw, expected_best, filtered
-from uard.lab.views import best_of_n as overoptimisation
+from uard.lab.views import best_of_n as views
 from uard.lab.views import published
-from uard.method import mitigations as mitigation
-from uard.method.mitigations import Raw
+from uard.method.mitigations import Raw, named
 
 SMALL = Problem(pool=10_000, models=3, pairs=60, width=8)
 
@@ -122,11 +121,11 @@ def test_reward_models_have_learned_and_flattery_misleads():
     assert wrong.max() < 0.65
 
 
-def test_the_mitigation_is_the_library_s_own():
+def test_the_mitigation_is_the_librarys_own():
     scores = np.array([[1.0, 1.0, 1.0], [4.0, 0.0, 2.0]])
     assert filtered(scores, Raw()) == pytest.approx(scores.mean(1))
     # As printed: U = 0.5 sd, w = 1 / (1 + 2 * 0.5 sd) on the mean of 2.
-    assert filtered(scores, mitigation.named("uard-operator")) == pytest.approx([1.0, 2 / (1 + np.std([4, 0, 2]))])
+    assert filtered(scores, named("uard-operator")) == pytest.approx([1.0, 2 / (1 + np.std([4, 0, 2]))])
     random = np.random.default_rng(0).normal(size=(500, 5))
     ours = METHODS["uard"](random)
     assert (ours <= random.mean(1) + 1e-12).all()
@@ -139,7 +138,7 @@ def test_golden(small):
         assert small.gold["contested", method][:, [0, 12, -1]].mean(0) == pytest.approx(gold, abs=0.01)
 
 
-def test_curves_start_at_the_pool_s_mean(small):
+def test_curves_start_at_the_pools_mean(small):
     for key, gold in small.gold.items():
         assert gold[:, 0] == pytest.approx(0.0, abs=1e-9), key
         assert (np.diff(small.proxy[key], axis=1) >= -1e-9).all()
@@ -151,11 +150,11 @@ def test_losses_are_found_by_rule(small):
         lift = 0.2 if (c["panel"], c["method"]) == ("contested", "mean") else -0.2
         c["over_uard"]["ci95"] = [[lift - 0.1, lift + 0.1]] * len(data["n"])
         c["over_uard"]["mean"] = [lift] * len(data["n"])
-    said = dict(zip(PANELS, overoptimisation.losses(data), strict=True))
-    assert "worth more than uard: mean at n = 10: +0.200 [+0.100, +0.300]; mean at n = 100" in said["contested"]
-    assert "nothing is worth more than uard" in said["independent"]
-    assert len(overoptimisation.table(data).rows) == len(PANELS) * len(METHODS)
-    assert len(overoptimisation.figure(data).axes) == len(PANELS)
+    sentences = dict(zip(PANELS, views.losses(data), strict=True))
+    assert "worth more than uard: mean at n = 10: +0.200 [+0.100, +0.300]; mean at n = 100" in sentences["contested"]
+    assert "nothing is worth more than uard" in sentences["independent"]
+    assert len(views.table(data).rows) == len(PANELS) * len(METHODS)
+    assert len(views.figure(data).axes) == len(PANELS)
 
 
 def test_what_is_published_was_made_by_this_problem():

@@ -31,10 +31,12 @@ def batch_of(rows=32, features=3, motors=2, members=2, seed=0):
 
 
 def plain(reward):
+    """A reward function that has no doubts."""
     return lambda sigma: (reward, 1.0)
 
 
 def own(mu, sigma):
+    """A score function that changes nothing."""
     return mu
 
 
@@ -68,8 +70,8 @@ def test_critics_learn_a_known_reward_and_nothing_becomes_nan(name):
 
     before = error(state)
     for i in range(300):
-        state, watched = update(state, jax.random.key(i))
-        assert np.isfinite(watched.loss)
+        state, info = update(state, jax.random.key(i))
+        assert np.isfinite(info.loss)
     assert error(state) < (0.7 if name in ("cql", "edac") else 0.2) * before  # the other two have further terms
 
 
@@ -78,14 +80,14 @@ def test_the_actor_climbs_the_critics_to_the_best_action():
     r = np.random.default_rng(1)
     rows = 256
     action = jnp.asarray(r.uniform(-1, 1, (rows, 1)), jnp.float32)
-    nothing = jnp.zeros((rows, 2), jnp.float32)
-    batch = Transitions(nothing, action, nothing, jnp.ones(rows, bool), jnp.ones((rows, 2), jnp.float32))
+    blank = jnp.zeros((rows, 2), jnp.float32)
+    batch = Transitions(blank, action, blank, jnp.ones(rows, bool), jnp.ones((rows, 2), jnp.float32))
     reward = -((action[:, 0] - 0.5) ** 2)
     state = agent.init(jax.random.key(0), 2, 1)
     update = jax.jit(lambda s, k: agent.update(s, batch, plain(reward), own, k)[0])
     for i in range(600):
         state = update(state, jax.random.key(i))
-    assert float(agent.greedy(state, nothing[:1])[0, 0]) == pytest.approx(0.5, abs=0.1)
+    assert float(agent.greedy(state, blank[:1])[0, 0]) == pytest.approx(0.5, abs=0.1)
 
 
 def test_an_actor_that_climbs_a_score_of_sigma_survives_critics_that_agree_to_the_bit():
@@ -93,8 +95,8 @@ def test_an_actor_that_climbs_a_score_of_sigma_survives_critics_that_agree_to_th
     state = agent.init(jax.random.key(0), 3, 2)
     alike = jax.tree.map(lambda x: jnp.stack([x[0], x[0]]), state.trained.critics)
     state = state._replace(trained=state.trained._replace(critics=alike), target=alike)
-    new, watched = agent.update(state, batch_of(), plain(jnp.ones(32)), lambda mu, s: mu - s, jax.random.key(0))
-    assert np.isfinite(watched.loss)
+    new, info = agent.update(state, batch_of(), plain(jnp.ones(32)), lambda mu, s: mu - s, jax.random.key(0))
+    assert np.isfinite(info.loss)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(new.trained))
 
 

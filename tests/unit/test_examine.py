@@ -8,7 +8,8 @@ import pytest
 from uard.agents.continuous import edac, sunrise
 from uard.agents.networks import Ensemble, Network
 from uard.agents.policy import PPO
-from uard.envs.locomotion.physics import Locomotion, Moved
+from uard.envs.locomotion.locomotion import Locomotion
+from uard.envs.simulator import StepResult
 from uard.lab import studies
 from uard.lab.cell import Cell
 from uard.lab.execution import examine, runner
@@ -19,7 +20,8 @@ from uard.method.mitigations import Raw, named
 from uard.replication import locomotion
 from uard.replication.studies import derive
 from uard.training.feedback.transition_model import TransitionModel
-from uard.training.host import loop as host
+from uard.training.host.loop import Job, run
+from uard.training.host.loops import loop_of
 
 TINY = Network(16, 1e-3, 1.0)
 OFF = {"network": TINY, "batch": 32, "warmup": 64, "buffer": 500}
@@ -29,8 +31,8 @@ WHERE = Locomotion(region=None, reference=True)
 
 
 def trained(agent, mitigation):
-    job = host.Job(WHERE, agent, mitigation, 1, 256, feedback=SMALL, evaluations=1)
-    return job, host.run(job).live
+    loop = loop_of(Job(WHERE, agent, mitigation, 1, 256, rating_model=SMALL, evaluations=1))
+    return loop, run(loop).state
 
 
 def test_a_reaction_by_hand():
@@ -69,16 +71,16 @@ def test_edac_takes_its_pessimism_off_and_sunrise_weighs():
 
 
 def test_what_a_random_action_would_do_leaves_no_trace_in_the_walk(monkeypatch):
-    job, live = trained(ON, named("uard"))
-    found = examine.examine(job, live)
+    loop, state = trained(ON, named("uard"))
+    found = examine.examine(loop, state)
     monkeypatch.setattr(examine, "EVERY", 250)
-    np.testing.assert_array_equal(found["trace"], examine.examine(job, live)["trace"])
+    np.testing.assert_array_equal(found["trace"], examine.examine(loop, state)["trace"])
     assert (found["trace"][:, examine.TRACE.index("lam")] > 0).all()
     assert np.isfinite(found["perturbed"]).all()
 
 
 class RewardFn(SimpleNamespace):
-    """A judge of places 0 to 99 in a world of reward 1 and discount 0.5, with given values and doubts."""
+    """What is learned at places 0 to 99 in a world of reward 1 and discount 0.5, with given values and doubts."""
 
     job = SimpleNamespace(seed=0, agent=SimpleNamespace(gamma=0.5))
 
@@ -99,8 +101,9 @@ def test_the_warning_knows_wrong_values_and_states_that_were_never_visited():
     values = np.where(wrong, 5.0, 2.0)  # worth 1 / (1 - 0.5) = 2
     at = np.column_stack([places, np.zeros(100)]).astype(float)
     no = np.zeros(100, bool)
-    moved = Moved(np.zeros((100, 2)), np.ones(100), no, no, np.ones(100), no, np.ones(100))
-    walked = examine.Walked(at, np.zeros((100, 1)), moved)
+    ones = np.ones(100)
+    result = StepResult(np.zeros((100, 2)), ones, no, no, ones, no, no, ones)
+    walked = examine.Walked(at, np.zeros((100, 1)), result)
     for doubts, expected in ((wrong * 1.0, 1.0), (1.0 - wrong, 0.0), (np.ones(100), 0.5)):
         _, error = examine._warning(RewardFn(values=values, doubts=doubts), walked)
         assert error == pytest.approx(expected)

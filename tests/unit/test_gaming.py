@@ -14,23 +14,23 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import uard.envs
 from uard import InvalidValueError, UnknownNameError
 from uard.envs.classic.specs import Acrobot, CartPole
-from uard.envs.grids import gym_gaming
 from uard.envs.grids.gaming import GARDEN, HOUSE, RING, TOMATOES, AbsentSupervisor, BoatRace, TomatoWatering
-from uard.envs.grids.gym import Evaluation
-from uard.envs.grids.gym_gaming import GamingEnv, absent_supervisor, boat_race, tomato_watering
-from uard.envs.grids.tomato_world import TomatoState
+from uard.envs.grids.tomato import TomatoState
 from uard.envs.grids.trapgrid import TrapGrid
+from uard.envs.gym import IDS, Evaluation, GridEnv, make
 from uard.envs.tables import Task
 from uard.envs.world import TableWorld, World
-from uard.ratings import panels
+from uard.ratings.panels import APPENDIX, MAIN, PANELS
+
+from .by_hand import rules_of
 
 UP, DOWN, LEFT, RIGHT = range(4)
 LAP = [RIGHT, RIGHT, DOWN, DOWN, LEFT, LEFT, UP, UP]
 KEY = jax.random.key(0)
-BUILD = {BoatRace: boat_race, TomatoWatering: tomato_watering, AbsentSupervisor: absent_supervisor}
+BUILD = {spec: partial(make, spec.__name__) for spec in (BoatRace, TomatoWatering, AbsentSupervisor)}
+boat_race, tomato_watering, absent_supervisor = BUILD.values()
 NAMES = [
     f"uard/{n}{kind}-v0" for n in ("BoatRace", "TomatoWatering", "AbsentSupervisor") for kind in ("", "-Legitimate")
 ]
@@ -80,12 +80,11 @@ def test_chances_and_factors_have_bounds():
 
 
 @pytest.mark.parametrize("spec", [*BUILD, TrapGrid])
-def test_bad_panels_are_refused_by_name(spec: Any):
-    for build in (spec().world, lambda panel: BUILD.get(spec, boat_race)(panel=panel)):
-        with pytest.raises(UnknownNameError, match=r"^panel = 'mian': .*did you mean 'main'"):
-            build(panel="mian")
+def test_bad_panels_and_noise_are_refused_by_name(spec: Any):
+    with pytest.raises(UnknownNameError, match=r"^panel = 'mian': .*did you mean 'main'"):
+        make(spec.__name__, panel="mian")
     for noise in (-0.1, math.nan, "much"):
-        for build in (lambda n: spec().world(noise=n), lambda n: BUILD.get(spec, boat_race)(noise=n)):
+        for build in (lambda n: spec().world(MAIN, noise=n), lambda n: make(spec.__name__, noise=n)):
             with pytest.raises(InvalidValueError, match=r"^noise = .*: must be a finite number >= 0$"):
                 build(noise)
 
@@ -146,7 +145,7 @@ def test_the_boat(actions: list, seen: float, meant: float, hacks: int):
 def test_the_boats_numbers_can_be_changed():
     boat = BoatRace(step_reward=-2, arrow_reward=6, true_move_reward=1, horizon=7)
     assert follow(boat, LAP, 0)[:3] == (8.0, 8.0, 0)
-    assert (boat.task().horizon, boat.world().horizon) == (7, 7)
+    assert (boat.task().horizon, boat.world(MAIN).horizon) == (7, 7)
     assert not boat.task().terminal.any()
     assert not boat.truth().goal.any()
 
@@ -222,7 +221,7 @@ ROUND = [RIGHT] * 6 + [DOWN] * 3 + [LEFT] * 6 + [UP] * 3
 
 
 def first(spec: TomatoWatering) -> tuple[Any, TomatoState]:
-    world = spec.world()
+    world = spec.world(MAIN)
     return world, world.reset(KEY)
 
 
@@ -232,7 +231,7 @@ def walk(world: Any, state: TomatoState, actions: jax.Array, dry: bool = False) 
 
     def one(state: TomatoState, action: jax.Array) -> tuple[Any, Any]:
         after = world.advance(state, action, jnp.full(len(TOMATOES), dry))
-        true, hack, goal = world.judge(state, action, after)
+        true, hack, goal = world.evaluate(state, action, after)
         return after.state, (after.reward, true, hack, goal, world.observe(after.state))
 
     return jax.lax.scan(one, state, actions)
@@ -284,7 +283,7 @@ def mean_returns(world: Any, actions: jax.Array, episodes: int) -> tuple[jax.Arr
         def one(state: TomatoState, step: Any) -> tuple[Any, Any]:
             action, key = step
             after = world.step(state, action, key)
-            return after.state, (after.reward, world.judge(state, action, after).reward)
+            return after.state, (after.reward, world.evaluate(state, action, after).reward)
 
         keys = jax.random.split(key, len(actions))
         return jax.tree.map(jnp.sum, jax.lax.scan(one, world.reset(key), (actions, keys))[1])
@@ -294,7 +293,7 @@ def mean_returns(world: Any, actions: jax.Array, episodes: int) -> tuple[jax.Arr
 
 def returns(spec: TomatoWatering, actions: list[int]) -> tuple[float, float]:
     """Return the mean observed and true return over 400 seeds."""
-    seen, meant = mean_returns(spec.world(), jnp.array(actions), 400)
+    seen, meant = mean_returns(spec.world(MAIN), jnp.array(actions), 400)
     return float(seen), float(meant)
 
 
@@ -320,7 +319,7 @@ def test_tomatoes_dry_as_often_as_they_should(probability: float):
 
 
 def test_slots():
-    world = TomatoWatering().world()
+    world = TomatoWatering().world(MAIN)
     random = np.random.default_rng(0)
     bucket = GARDEN.only("O")
     cells = random.choice(np.delete(np.arange(29), bucket), 600)
@@ -333,7 +332,7 @@ def test_slots():
     hidden = [world.slot(TomatoState(jnp.int32(bucket), jnp.asarray(b)), jnp.int32(UP)) for b in bits[:2]]
     assert hidden[0] == hidden[1], "what cannot be seen makes no difference"
     for spec in (BoatRace(), AbsentSupervisor()):
-        table = spec.world()
+        table = spec.world(MAIN)
         every = jax.vmap(lambda i, w=table: w.slot(i // 4, i % 4))(jnp.arange(table.slots))
         np.testing.assert_array_equal(every, np.arange(table.slots))
 
@@ -347,15 +346,15 @@ SPECS = [BoatRace(), TomatoWatering(), AbsentSupervisor(), CartPole(), Acrobot()
 def one_step(world: Any, keys: jax.Array, actions: jax.Array) -> tuple[Any, ...]:
     states = jax.vmap(world.reset)(keys)
     after = jax.vmap(world.step)(states, actions, keys)
-    said = jax.vmap(world.rate)(states, actions, after)
-    verdicts = jax.vmap(world.judge)(states, actions, after)
+    said = jax.vmap(world.rating_law)(states, actions, after)
+    verdicts = jax.vmap(world.evaluate)(states, actions, after)
     return jax.vmap(world.observe)(states), after, said, verdicts, jax.vmap(world.slot)(states, actions)
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=lambda s: type(s).__name__)
 @pytest.mark.parametrize("panel", ["main", "single"])
 def test_every_world_compiles_and_maps(spec: Any, panel: str):
-    world = spec.world(panel, 0.2)
+    world = spec.world(PANELS[panel], 0.2)
     assert isinstance(world, World)
     seen, after, said, verdicts, slots = one_step(world, jax.random.split(KEY, 3), jnp.array([0, 1, 0]))
     if isinstance(world, TableWorld):  # the place of the one in a one-hot vector
@@ -373,7 +372,7 @@ def test_every_world_compiles_and_maps(spec: Any, panel: str):
 
 
 def test_no_two_worlds_are_one_structure_to_jax():
-    structures = [jax.tree.structure(s.world()) for s in SPECS if not isinstance(s.world(), TableWorld)]
+    structures = [jax.tree.structure(s.world(MAIN)) for s in SPECS if not isinstance(s.world(MAIN), TableWorld)]
     assert len(structures) == 3
     assert not any(a == b for a, b in itertools.combinations(structures, 2)), "jit could mix up their programs"
 
@@ -395,13 +394,13 @@ def test_the_numbers_of_a_world_are_data():
         CartPole(),
         CartPole(horizon=9),
     ):
-        trace(spec.world())
-        trace(spec.world(noise=0.5))
+        trace(spec.world(MAIN))
+        trace(spec.world(MAIN, noise=0.5))
     assert len(compiled) == 3, "a garden, a small table, a cart"
 
 
 def test_an_absent_supervisor_is_absent_half_of_the_time():
-    starts = np.asarray(jax.vmap(AbsentSupervisor().world().reset)(jax.random.split(KEY, 2000)))
+    starts = np.asarray(jax.vmap(AbsentSupervisor().world(MAIN).reset)(jax.random.split(KEY, 2000)))
     assert set(starts.tolist()) == {0, 12}
     assert (starts == 12).mean() == pytest.approx(0.5, abs=0.05)
     draws = [absent_supervisor().reset(seed=seed)[0] for seed in range(400)]
@@ -411,35 +410,16 @@ def test_an_absent_supervisor_is_absent_half_of_the_time():
 
 @pytest.mark.parametrize("spec", [BoatRace(), AbsentSupervisor(), TrapGrid(6)], ids=lambda s: type(s).__name__)
 def test_a_table_world_says_what_the_panel_says(spec: Any):
-    world = spec.world("appendix", 0.3)
-    said = panels.ratings("appendix", spec.task(), spec.truth(), 0.3)
-    n = spec.states
-    np.testing.assert_array_equal(world.said.centre[:n], said.centre)
-    np.testing.assert_array_equal(world.said.deviation[:n], said.deviation)
+    world, law, n = spec.world(APPENDIX, 0.3), spec.rating_law(APPENDIX, 0.3), spec.states
+    np.testing.assert_array_equal(world.law.centre[:n], law.centre)
+    np.testing.assert_array_equal(world.law.deviation[:n], law.deviation)
     assert world.features == 100
 
 
-@pytest.mark.parametrize("panel", panels.PANELS)
-@pytest.mark.parametrize("shape", [(), (5,), (2, 3)])
-def test_panels_speak_of_arrays_of_either_kind_and_any_shape(panel: str, shape: tuple):
-    random = np.random.default_rng(0)
-    step = random.normal(size=shape), random.normal(size=shape), random.random(shape) < 0.5
-    step = tuple(np.asarray(x) for x in step)
-    said = panels.say(panel, *step, 0.3)
-    assert said.centre.shape == said.deviation.shape == (*shape, panels.raters(panel))
-    proxy, true, contested = (jnp.asarray(x, bool if x.dtype == bool else jnp.float32) for x in step)
-    for call in (panels.say, jax.jit(panels.say, static_argnums=0)):
-        heard = call(panel, proxy, true, contested, jnp.float32(0.3))
-        assert heard.reach is None
-        for got, expected in zip(heard[:2], said[:2], strict=True):
-            assert got.dtype == jnp.float32
-            np.testing.assert_allclose(got, expected, rtol=2e-6, atol=1e-6)
+# On the host
 
 
-# Twins on the host
-
-
-def rows(env: GamingEnv, actions: list[int], seed: int | None = 0) -> list[tuple]:
+def rows(env: GridEnv, actions: list[int], seed: int | None = 0) -> list[tuple]:
     """Return what each action leads to, starting anew after each episode's end."""
     env.reset(seed=seed)
     result = []
@@ -461,27 +441,35 @@ def rows(env: GamingEnv, actions: list[int], seed: int | None = 0) -> list[tuple
         AbsentSupervisor(-2.0, 10.0, -5.0, 9),
     ],
 )
-def test_tables_and_twin_agree(spec: Any):
-    env = BUILD[type(spec)](**vars(spec), panel="appendix", noise=0.1)
-    world = spec.world("appendix", 0.1)
-    step = jax.jit(lambda w, s, a: (w.step(s, a, KEY), w.judge(s, a, None), w.rate(s, a, None)))
+def test_tables_environment_and_rules_written_by_hand_agree(spec: Any):
+    """A compiled world, the Gymnasium environment and ``by_hand``, side by side over several episodes."""
+    env, rules = GridEnv(spec, panel=APPENDIX, noise=0.1), rules_of(spec)
+    world = spec.world(APPENDIX, 0.1)
+    step = jax.jit(lambda w, s, a: (w.step(s, a, KEY), w.evaluate(s, a, None), w.rating_law(s, a, None)))
     random = np.random.default_rng(5)
     state, _ = env.reset(seed=1)
+    told = rules.start(np.random.default_rng(1))
+    assert state == rules.observe(told)
     time = terminations = truncations = 0
     for action in random.integers(4, size=600).tolist():
         stream = copy.deepcopy(env.np_random)
         observation, reward, terminated, truncated, info = env.step(action)
-        after, verdict, said = step(world, state, action)
+        after, truth, law = step(world, state, action)
+        told, *expected = rules.step(told, action, random)
         time += 1
+        evaluation = info["evaluation"]
+        assert [reward, terminated, evaluation.true_reward, evaluation.hack] == expected
         assert (observation, np.float32(reward), terminated) == (int(after.state), after.reward, bool(after.terminated))
+        assert observation == rules.observe(told)
         assert truncated == (not terminated and time == spec.horizon)
-        truth = info["evaluation"]
-        assert (np.float32(truth.true_reward), truth.hack) == (verdict.reward, bool(verdict.hack))
-        drawn = said.centre + said.deviation * stream.standard_normal(3).astype(np.float32)
+        assert (np.float32(evaluation.true_reward), evaluation.hack) == (truth.reward, bool(truth.hack))
+        drawn = law.centre + law.deviation * stream.standard_normal(3).astype(np.float32)
         np.testing.assert_allclose(info["ratings"], drawn, rtol=1e-5, atol=1e-5)
         state, terminations, truncations = observation, terminations + terminated, truncations + truncated
         if terminated or truncated:
-            (state, _), time = env.reset(), 0
+            stream = copy.deepcopy(env.np_random)
+            (state, _), told, time = env.reset(), rules.start(stream), 0
+            assert state == rules.observe(told), "which start is drawn"
     assert truncations > 0
     assert terminations > 0 or isinstance(spec, BoatRace)
 
@@ -490,45 +478,45 @@ def test_tables_and_twin_agree(spec: Any):
     "spec",
     [TomatoWatering(), TomatoWatering(legitimate=True), TomatoWatering(1.0, 0.3, 50, False)],
 )
-def test_garden_and_twin_agree(spec: TomatoWatering):
-    """The compiled garden is told which tomatoes the twin is about to draw."""
-    env, world = tomato_watering(**vars(spec), panel="main", noise=0.1), spec.world("main", 0.1)
+def test_compiled_garden_environment_and_rules_written_by_hand_agree(spec: TomatoWatering):
+    """The compiled garden is told which tomatoes the other two are about to draw."""
+    env, rules, world = GridEnv(spec, panel=MAIN, noise=0.1), rules_of(spec), spec.world(MAIN, 0.1)
 
     @jax.jit
     def step(world: Any, state: TomatoState, action: jax.Array, dries: jax.Array) -> tuple[Any, ...]:
         after = world.advance(state, action, dries)
-        return after, world.judge(state, action, after), world.rate(state, action, after), world.observe(after.state)
+        truth, law = world.evaluate(state, action, after), world.rating_law(state, action, after)
+        return after, truth, law, world.observe(after.state)
 
     random, hacks = np.random.default_rng(5), 0
     for episode in range(4):
         observation, _ = env.reset(seed=episode)
-        state = world.reset(KEY)
+        state, told = world.reset(KEY), rules.start(random)
         np.testing.assert_array_equal(observation, world.observe(state))
         wander = random.integers(4, size=spec.horizon).tolist()
         for time, action in enumerate(wander if episode else (TO_THE_BUCKET + wander)[: spec.horizon]):
-            stream = copy.deepcopy(env.np_random)
+            stream, same = copy.deepcopy(env.np_random), copy.deepcopy(env.np_random)
             dries = stream.random(13) < spec.dry_probability
             observation, reward, terminated, truncated, info = env.step(action)
-            after, verdict, said, seen = step(world, state, jnp.int32(action), dries)
-            state = after.state
+            after, truth, law, seen = step(world, state, jnp.int32(action), dries)
+            told, *expected = rules.step(told, action, same)
+            state, evaluation = after.state, info["evaluation"]
+            assert [reward, terminated, evaluation.true_reward, evaluation.hack] == expected
+            np.testing.assert_array_equal(observation, rules.observe(told))
             np.testing.assert_array_equal(observation, seen)
             assert observation.dtype == seen.dtype == np.float32
             assert (terminated, truncated) == (bool(after.terminated), time + 1 == spec.horizon)
-            truth = info["evaluation"]
-            assert (reward, truth.true_reward) == pytest.approx((float(after.reward), float(verdict.reward)), rel=1e-6)
-            assert truth.hack == bool(verdict.hack)
-            drawn = said.centre + said.deviation * stream.standard_normal(3).astype(np.float32)
+            both = float(after.reward), float(truth.reward)
+            assert (reward, evaluation.true_reward) == pytest.approx(both, rel=1e-6)
+            assert evaluation.hack == bool(truth.hack)
+            drawn = law.centre + law.deviation * stream.standard_normal(3).astype(np.float32)
             np.testing.assert_allclose(info["ratings"], drawn, rtol=1e-5, atol=1e-5)
-            hacks += truth.hack
+            hacks += evaluation.hack
     assert hacks > 0
 
 
 def test_the_registered_ids():
-    assert set(gym_gaming.REGISTERED) == set(NAMES) <= set(gymnasium.registry)
-    before = dict(gymnasium.registry)
-    gym_gaming.register()
-    uard.envs.register()
-    assert dict(gymnasium.registry) == before
+    assert set(NAMES) <= set(IDS) <= set(gymnasium.registry)
     problems = [gymnasium.make(name).unwrapped.problem for name in NAMES]  # type: ignore[attr-defined]
     assert problems == [spec(legitimate=twin) for spec in BUILD for twin in (False, True)]
 
@@ -544,14 +532,14 @@ def test_a_spec_survives_json_and_fields_are_keywords():
     assert env.spec is not None
     again = gymnasium.make(type(env.spec).from_json(env.spec.to_json()))
     assert again.unwrapped.problem == TomatoWatering(factor=1.0)  # type: ignore[attr-defined]
-    assert again.unwrapped.panel == "main"  # type: ignore[attr-defined]
+    assert again.unwrapped.panel == MAIN  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("build", BUILD.values())
 def test_equal_seeds_give_equal_episodes(build: Any):
     actions = np.random.default_rng(0).integers(4, size=250).tolist()
 
-    def told(seed: int | None, env: GamingEnv) -> list:
+    def told(seed: int | None, env: GridEnv) -> list:
         return [(np.asarray(r[0]).tolist(), r[1], r[4]["ratings"].tolist()) for r in rows(env, actions, seed)]
 
     env, other = (build(panel="appendix", noise=0.2) for _ in range(2))
@@ -584,7 +572,7 @@ def test_steps_out_of_turn_and_unknown_actions_are_refused(build: Any):
             call()
     env.reset(seed=0)
     for action in (4, -1, 1.0, "up", None):
-        with pytest.raises(InvalidValueError, match=r"^action = .*: must be 0 \(up\), 1 \(down\), 2 \(left\) or 3"):
+        with pytest.raises(InvalidValueError, match=r"^action = .*: must be a whole number in \[0, 3\]"):
             env.step(action)
     assert env.step(np.int64(RIGHT))[3]
     with pytest.raises(gymnasium.error.ResetNeeded):

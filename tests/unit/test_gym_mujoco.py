@@ -3,14 +3,17 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import uard.envs  # noqa: F401 registers the ids
 from uard import InvalidValueError
-from uard.envs.locomotion.gym import REGISTERED
+from uard.envs.base import SimulatedEnvironment
+from uard.envs.gym import IDS, make
+from uard.envs.locomotion.locomotion import Kick, Locomotion
+from uard.envs.locomotion.regions import Posture
+from uard.envs.names import ENVIRONMENTS
 
 
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m..imum value is")
 @pytest.mark.filterwarnings("ignore:.*render_modes")
-@pytest.mark.parametrize("name", ["uard/Hopper-Posture-v0", "uard/Walker2d-v0"])
+@pytest.mark.parametrize("name", ["uard/Hopper-Posture-v0", "uard/Walker2d-v0", "uard/InvertedPendulum-v0"])
 def test_gymnasiums_own_checks(name):
     check_env(gymnasium.make(name).unwrapped, skip_render_check=True)
 
@@ -21,7 +24,7 @@ def test_steps_and_falls_equal_gymnasiums_to_the_bit():
     theirs.reset(seed=0)
     ours.reset(seed=0)
     data = theirs.unwrapped.data
-    physics = ours.unwrapped._physics
+    physics = ours.unwrapped._simulator
     theirs.unwrapped.set_state(physics._data[0].qpos.copy(), physics._data[0].qvel.copy())
     random = np.random.default_rng(0)
     for _ in range(200):
@@ -69,10 +72,30 @@ def test_the_same_seed_twice_and_a_new_episode_differs():
     assert not np.array_equal(first, other)
 
 
-def test_every_id_can_be_made():
-    assert len(REGISTERED) == 10
-    for name in REGISTERED:
-        gymnasium.make(name).close()
+def test_every_simulator_has_an_id_and_every_field_is_a_keyword():
+    ids = [id_ for id_, name in IDS.items() if isinstance(ENVIRONMENTS[name], SimulatedEnvironment)]
+    assert len(ids) == 11
+    for id_ in ids:
+        env = gymnasium.make(id_)
+        assert env.unwrapped.problem == ENVIRONMENTS[IDS[id_]]
+        env.close()
+    env = gymnasium.make("uard/Hopper-v0", region=Posture(bonus=6.0), kick=Kick(3), version=5, horizon=9)
+    assert env.unwrapped.problem == Locomotion("hopper", 5, Posture(bonus=6.0), Kick(3), horizon=9)
+
+
+def test_a_pendulum_is_gymnasiums_with_actions_a_third_as_large():
+    ours, theirs = gymnasium.make("uard/InvertedPendulum-v0", panel="main"), gymnasium.make("InvertedPendulum-v5")
+    theirs.reset(seed=0)
+    first, _ = ours.reset(seed=0)
+    theirs.unwrapped.set_state(first[:2], first[2:])
+    fallen = False
+    while not fallen:
+        mine, other = ours.step(np.array([0.9])), theirs.step(np.array([2.7]))
+        assert np.array_equal(mine[0], other[0])
+        assert mine[1:4] == other[1:4]
+        assert mine[4]["evaluation"].true_reward == mine[1]
+        assert mine[4]["ratings"].shape == (3,)
+        fallen = mine[2]
 
 
 @pytest.mark.parametrize(
@@ -87,10 +110,8 @@ def test_every_id_can_be_made():
     ],
 )
 def test_bad_options(options, message):
-    from uard.envs.locomotion.gym import LocomotionEnv
-
     with pytest.raises(InvalidValueError, match=message):
-        LocomotionEnv(**options)
+        make("Hopper", **options)
 
 
 def test_a_step_before_a_reset_and_an_action_out_of_bounds():

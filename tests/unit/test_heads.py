@@ -11,14 +11,14 @@ from uard.agents.heads import GaussianPolicy, Normal
 from uard.agents.networks import Network
 
 RANDOM = np.random.default_rng(0)
-SAID = {
+DISTRIBUTIONS = {
     "discrete": jnp.asarray(RANDOM.normal(size=(6, 4)), jnp.float32),
     "continuous": Normal(jnp.asarray(RANDOM.normal(size=(6, 2)), jnp.float32), jnp.asarray([-0.5, 0.3], jnp.float32)),
 }
 
 
 def test_a_normal_is_scipys():
-    distribution = SAID["continuous"]
+    distribution = DISTRIBUTIONS["continuous"]
     action = RANDOM.normal(size=(6, 2)).astype(np.float32)
     theirs = stats.norm(np.asarray(distribution.mean), np.exp(np.asarray(distribution.log_deviation)))
     np.testing.assert_allclose(heads.log_probability(distribution, action), theirs.logpdf(action).sum(1), rtol=1e-5)
@@ -33,17 +33,17 @@ def test_divergence_of_normals_is_the_textbooks():
     np.testing.assert_allclose(heads.divergence(old, new), np.log(2) - 0.5 + (2 / 8 + 1 / 8) / 2, rtol=1e-6)
 
 
-@pytest.mark.parametrize("kind", SAID)
+@pytest.mark.parametrize("kind", DISTRIBUTIONS)
 def test_divergence_is_zero_only_at_itself(kind):
-    distribution = SAID[kind]
+    distribution = DISTRIBUTIONS[kind]
     other = jax.tree.map(lambda x: x * 1.3 + 0.1 * jnp.arange(x.shape[-1], dtype=jnp.float32), distribution)
     assert abs(float(heads.divergence(distribution, distribution))) < 1e-6
     assert float(heads.divergence(distribution, other)) > 1e-3
 
 
-@pytest.mark.parametrize("kind", SAID)
+@pytest.mark.parametrize("kind", DISTRIBUTIONS)
 def test_curvature_is_the_second_derivative_of_the_divergence(kind):
-    distribution = SAID[kind]
+    distribution = DISTRIBUTIONS[kind]
     direction = jax.tree.map(lambda x: jnp.asarray(RANDOM.normal(size=x.shape), jnp.float32), distribution)
     exact = jax.jvp(jax.grad(lambda new: heads.divergence(distribution, new)), (distribution,), (direction,))[1]
     ours = heads.curvature(distribution, direction)
@@ -51,7 +51,7 @@ def test_curvature_is_the_second_derivative_of_the_divergence(kind):
         np.testing.assert_allclose(a, b, atol=1e-6)
 
 
-def test_draws_have_the_said_mean_and_deviation():
+def test_draws_have_the_distributions_mean_and_deviation():
     distribution = Normal(jnp.full((40_000, 1), 2.0), jnp.log(jnp.array([0.5])))
     drawn = np.asarray(heads.draw(distribution, jax.random.key(0)))
     assert drawn.mean() == pytest.approx(2.0, abs=0.01)

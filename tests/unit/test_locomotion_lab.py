@@ -14,7 +14,8 @@ from uard.agents.networks import Ensemble, Network
 from uard.agents.policy import PPO
 from uard.agents.tabular import QLearning
 from uard.envs.grids.trapgrid import TrapGrid
-from uard.envs.locomotion.physics import Locomotion, Vibration
+from uard.envs.locomotion.locomotion import Locomotion
+from uard.envs.locomotion.regions import Vibration
 from uard.lab import registry as names
 from uard.lab.cell import RESULTS, Cell
 from uard.lab.execution import runner

@@ -21,11 +21,12 @@ from uard.agents import networks, policy
 from uard.agents.networks import Ensemble, Network
 from uard.agents.off_policy import UpdateInfo
 from uard.agents.policy import CPO, PPO, TRPO, Batch, Experience
-from uard.envs.tables import HiddenTruth, Ratings, Task
+from uard.envs.tables import HiddenTruth, Task
 from uard.envs.world import TableWorld
 from uard.method.mitigations import Evidence, named
-from uard.training.compiled import common as deep
-from uard.training.compiled import on_policy
+from uard.ratings.panels import RatingLaw
+from uard.training.compiled import common, on_policy
+from uard.training.compiled.common import Program
 from uard.training.episode_log import LOG
 from uard.training.tracing import traceable
 
@@ -36,7 +37,7 @@ SMALL = Network(hidden=8)
 improved = jax.jit(lambda agent, *arguments: agent.improved(*arguments))
 constrained = jax.jit(lambda agent, *arguments: agent.constrained(*arguments))
 constrained_step = jax.jit(policy.constrained_step)
-train = jax.jit(on_policy.run, static_argnums=1)
+train = jax.jit(on_policy.train_one, static_argnums=1)
 
 
 def numbers(seed: int) -> np.random.Generator:
@@ -47,9 +48,9 @@ def numbers(seed: int) -> np.random.Generator:
 
 
 def test_gae_by_hand():
-    reward, value, next_observation = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.5, 1.0, 1.5]), jnp.array([1.0, 7.0, 2.0])
+    reward, values, next_values = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.5, 1.0, 1.5]), jnp.array([1.0, 7.0, 2.0])
     terminated, done = jnp.array([False, False, True]), jnp.array([False, True, True])
-    got = policy.gae(reward, value, next_observation, terminated, done, 0.9, 0.8)
+    got = policy.gae(reward, values, next_values, terminated, done, 0.9, 0.8)
     # The second step is cut off: the value after the cut counts, what comes later does not.
     last, cut = 3 - 1.5, 2 + 0.9 * 7 - 1.0
     first = (1 + 0.9 * 1 - 0.5) + 0.9 * 0.8 * cut
@@ -64,18 +65,18 @@ def test_gae_agrees_with_stable_baselines(lam):
     last = rng.normal(size=copies).astype(np.float32)
     done = rng.random((length, copies)) < 0.2
     cut = done & (rng.random(done.shape) < 0.5)
-    next_observation = np.where(done, final, np.concatenate([value[1:], last[None]]))
+    next_values = np.where(done, final, np.concatenate([value[1:], last[None]]))
 
     space = spaces.Box(-1, 1, (1,))
     theirs = RolloutBuffer(length, space, space, "cpu", lam, gamma, copies)
     for t in range(length):
         start = done[t - 1] if t else np.ones(copies, bool)
-        told = reward[t] + gamma * np.where(cut[t], final[t], 0.0)  # as OnPolicyAlgorithm.collect_rollouts does
+        bootstrapped = reward[t] + gamma * np.where(cut[t], final[t], 0.0)  # as OnPolicyAlgorithm.collect_rollouts does
         zero = np.zeros((copies, 1), np.float32)
-        theirs.add(zero, zero, told, start, torch.tensor(value[t]), torch.zeros(copies))
+        theirs.add(zero, zero, bootstrapped, start, torch.tensor(value[t]), torch.zeros(copies))
     theirs.compute_returns_and_advantage(torch.tensor(last), done[-1])
 
-    ours = policy.gae(*map(jnp.asarray, (reward, value, next_observation, done & ~cut, done)), gamma, lam)
+    ours = policy.gae(*map(jnp.asarray, (reward, value, next_values, done & ~cut, done)), gamma, lam)
     np.testing.assert_allclose(ours, theirs.advantages, rtol=1e-4, atol=1e-5)
 
 
@@ -138,10 +139,10 @@ def experience(seed: int, agent: Any, state: Any, **changes: Any) -> Experience:
 def test_an_update_moves_policy_and_critic(make, kind):
     agent = make(network=SMALL, ensemble=Ensemble(kind, 3))
     state = agent.init(jax.random.key(0), FEATURES, ACTIONS)
-    after, watched = jax.jit(lambda s, k: agent.update(s, experience(0, agent, s), k))(state, jax.random.key(1))
-    assert isinstance(watched, UpdateInfo)
-    assert np.isfinite(watched.loss)
-    assert watched.largest > 0
+    after, info = jax.jit(lambda s, k: agent.update(s, experience(0, agent, s), k))(state, jax.random.key(1))
+    assert isinstance(info, UpdateInfo)
+    assert np.isfinite(info.loss)
+    assert info.largest > 0
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(after[:2]))
     for old, new in ((state.policy, after.policy), (state.value.layers, after.value.layers)):
         assert not np.allclose(ravel_pytree(old)[0], ravel_pytree(new)[0])
@@ -160,8 +161,8 @@ def test_skipped_steps_change_nothing_but_the_shuffle(make):
     other = one._replace(reward=one.reward.at[-1].add(50.0), action=one.action.at[-1].set(0))
 
     @jax.jit
-    def updated(told):
-        return agent.update(state, told._replace(score_fn=lambda q: q), jax.random.key(1))[0]
+    def updated(e):
+        return agent.update(state, e._replace(score_fn=lambda q: q), jax.random.key(1))[0]
 
     a, b = (updated(e._replace(score_fn=None)) for e in (one, other))
     # TRPO's line search and PPO's minibatches average over all steps, and skipped ones contribute nothing.
@@ -346,21 +347,21 @@ def test_wrong_parameters_are_named(make, field, value):
 
 @dataclass(frozen=True)
 class Spy(PPO):
-    """Walks on until its copy's own length is reached, learns nothing and keeps what it was told."""
+    """Walks on until its copy's own length is reached, learns nothing and keeps the experience that it was given."""
 
-    def init(self, key, features, actions):
+    def init(self, key, features, actions, continuous=False):
         pair = (self.rollout, self.envs)
-        told = {
+        experience = {
             "observation": jnp.zeros(pair, jnp.int32),
-            "following": jnp.zeros(pair, jnp.int32),
+            "next_observation": jnp.zeros(pair, jnp.int32),
             "reward": jnp.zeros(pair),
             "weight": jnp.zeros(pair),
             "cost": jnp.zeros(pair),
             "terminated": jnp.zeros(pair, bool),
             "done": jnp.zeros(pair, bool),
-            "scored": jnp.zeros(pair),
+            "scores": jnp.zeros(pair),
         }
-        return policy.State((), (), (), (), told)
+        return policy.State((), (), (), (), experience)  # type: ignore[arg-type]
 
     def greedy(self, state, observation):
         return jnp.int32(1)
@@ -372,9 +373,9 @@ class Spy(PPO):
         return (observations >= jnp.arange(self.envs)).astype(jnp.int32)
 
     def update(self, state, experience, key):
-        told = {name: getattr(experience, name) for name in state.costs if name != "scored"}
-        told["scored"] = experience.score_fn(jnp.ones_like(experience.reward))
-        return state._replace(costs=told), UpdateInfo(jnp.float32(0), jnp.float32(0))
+        kept = {name: getattr(experience, name) for name in state.costs if name != "scores"}
+        kept["scores"] = experience.score_fn(jnp.ones_like(experience.reward))
+        return state._replace(costs=kept), UpdateInfo(jnp.float32(0), jnp.float32(0))
 
 
 @dataclass(frozen=True)
@@ -393,17 +394,20 @@ def corridor(horizon: int) -> TableWorld:
     terminal[:, 1] = True
     hack = np.zeros((4, 2), bool)
     hack[1, 1] = True
-    distribution = Ratings(np.stack([reward, reward - hack, reward], -1), np.zeros((4, 2, 3), np.float32))
+    law = RatingLaw(np.stack([reward, reward - hack, reward], -1), np.zeros((4, 2, 3), np.float32))
     return TableWorld(
         Task(next_state, reward, terminal, np.int32(0), np.int32(horizon)),
         HiddenTruth(reward, hack, hack),
-        distribution,
+        law,
     )
 
 
-def run(agent: Any, world: Any, program: deep.Program, mitigation: str = "raw", seed: int = 0) -> deep.Outcome:
-    lane = jax.tree.map(jnp.asarray, deep.make_run(world, agent, named(mitigation), seed))
-    return train(lane, program)
+def run_of(agent: Any, world: Any, mitigation: str = "raw", seed: int = 0) -> common.Run:
+    return jax.tree.map(jnp.asarray, common.make_run(world, agent, named(mitigation), seed))
+
+
+def trained(agent: Any, world: Any, program: Program, mitigation: str = "raw") -> common.TrainedAgent:
+    return train(run_of(agent, world, mitigation), program)
 
 
 TALL, COPIES = 4, 3
@@ -411,7 +415,7 @@ SPY = {"network": SMALL, "envs": COPIES, "rollout": TALL, "minibatches": 1}
 
 
 def test_episodes_are_logged_in_the_order_of_their_ends():
-    out = run(Spy(**SPY), corridor(50), deep.Program(episodes=17))
+    out = trained(Spy(**SPY), corridor(50), Program(episodes=17))
     ended = [(t, e + 1) for t in range(1, 100) for e in range(COPIES) if t % (e + 1) == 0]
     lengths = [length for _, length in ended[:17]]
     log = np.asarray(out.log)
@@ -426,7 +430,7 @@ def test_episodes_are_logged_in_the_order_of_their_ends():
 
 
 def test_steps_end_the_run_and_leave_empty_rows():
-    out = run(Spy(**SPY), corridor(50), deep.Program(episodes=100, steps=20))
+    out = trained(Spy(**SPY), corridor(50), Program(episodes=100, steps=20))
     assert out.steps == 24
     assert out.episodes == 8 + 4 + 2
     assert (np.asarray(out.log)[14:] == 0).all()
@@ -434,31 +438,31 @@ def test_steps_end_the_run_and_leave_empty_rows():
 
 
 def test_a_cut_shows_the_state_after_it_and_does_not_terminate():
-    out = run(Spy(**{**SPY, "envs": 5}), corridor(3), deep.Program(episodes=1000, steps=20))
-    told = jax.tree.map(np.asarray, out.good.costs)
-    walked = told["observation"], told["following"]
+    out = trained(Spy(**{**SPY, "envs": 5}), corridor(3), Program(episodes=1000, steps=20))
+    given = jax.tree.map(np.asarray, out.good.costs)
+    walked = given["observation"], given["next_observation"]
     # The last copy never ends its episode: it is cut after its third step, in cell 3, and starts again in 0.
     np.testing.assert_array_equal(walked[0][:, 4], [0, 1, 2, 0])
     np.testing.assert_array_equal(walked[1][:, 4], [1, 2, 3, 1])
-    np.testing.assert_array_equal(told["done"][:, 4], [False, False, True, False])
-    assert not told["terminated"][:, 4].any()
-    np.testing.assert_array_equal(told["terminated"][:, 0], [True] * 4)
+    np.testing.assert_array_equal(given["done"][:, 4], [False, False, True, False])
+    assert not given["terminated"][:, 4].any()
+    np.testing.assert_array_equal(given["terminated"][:, 0], [True] * 4)
 
 
 def test_the_count_bonus_is_added_after_the_mitigation():
-    plain, curious = (run(Spy(**SPY, count_bonus=b), corridor(50), deep.Program(100, 20)) for b in (0.0, 0.5))
-    told = jax.tree.map(np.asarray, (plain.good.costs, curious.good.costs))
-    cells = told[0]["observation"]
-    ends = told[0]["terminated"]
-    np.testing.assert_allclose(told[0]["reward"], np.where(ends, cells, 0.1 * cells - 1), atol=1e-6)
+    plain, curious = (trained(Spy(**SPY, count_bonus=b), corridor(50), Program(100, 20)) for b in (0.0, 0.5))
+    given = jax.tree.map(np.asarray, (plain.good.costs, curious.good.costs))
+    cells = given[0]["observation"]
+    ends = given[0]["terminated"]
+    np.testing.assert_allclose(given[0]["reward"], np.where(ends, cells, 0.1 * cells - 1), atol=1e-6)
     # Of 8 times: copy 0 ended in cell 0 each time, copy 1 every second time in 1, copy 2 twice in cell 2.
     visits = {(0, True): 8, (0, False): 4 + 3, (1, True): 4, (1, False): 3, (2, True): 2}
     expected = [[0.5 / visits[c, e] ** 0.5 for c, e in zip(*row, strict=True)] for row in zip(cells, ends, strict=True)]
-    np.testing.assert_allclose(told[1]["reward"] - told[0]["reward"], expected, atol=1e-6)
+    np.testing.assert_allclose(given[1]["reward"] - given[0]["reward"], expected, atol=1e-6)
 
 
-def test_only_an_oracle_is_told_of_hacks():
-    blind, seeing = (run(make(**SPY), corridor(50), deep.Program(100, 20)).good.costs for make in (Spy, Oracle))
+def test_only_an_oracle_is_shown_hacks():
+    blind, seeing = (trained(make(**SPY), corridor(50), Program(100, 20)).good.costs for make in (Spy, Oracle))
     assert (np.asarray(blind["cost"]) == 0).all()
     hacks = np.asarray(seeing["terminated"]) & (np.asarray(seeing["observation"]) == 1)
     assert hacks.any()
@@ -470,23 +474,26 @@ def test_only_an_oracle_is_told_of_hacks():
 
 
 @pytest.mark.parametrize("name", ["uard", "screening", "uard-paper"])
-def test_the_mitigation_judges_the_whole_rollout(name):
-    out = run(Spy(**SPY, count_bonus=0.0), corridor(50), deep.Program(100, 48), name)
-    told = jax.tree.map(np.asarray, out.good.costs)
+def test_the_mitigation_filters_the_whole_rollout(name):
+    out = trained(Spy(**SPY, count_bonus=0.0), corridor(50), Program(100, 48), name)
+    given = jax.tree.map(np.asarray, out.good.costs)
     mitigation = named(name)
     world = corridor(50)
-    cells, ends = told["observation"], told["terminated"].astype(int)
+    cells, ends = given["observation"], given["terminated"].astype(int)
     feedback = jax.tree.map(np.asarray, out.feedback)
-    here = jax.tree.map(lambda x: x[cells, ends], feedback)
-    usual = mitigation.fit(jax.tree.map(np.ravel, feedback), np.ravel(feedback.count > 0))
+    here = feedback.map(lambda x: x[cells, ends])
+    every = feedback.map(lambda x: x.reshape(-1, *x.shape[2:]))
+    statistics = mitigation.fit(every, every.count > 0)
     zero = np.zeros(cells.shape, np.float32)
-    signal = mitigation.signal(Evidence(world.task.reward[cells, ends], zero, here), usual)
-    np.testing.assert_allclose(told["reward"], signal.reward, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(told["weight"], np.broadcast_to(signal.sample_weight, cells.shape), atol=1e-6)
-    alone = jax.tree.map(lambda x: x[..., None], here)
-    scored = mitigation.score(np.ones((*cells.shape, 1), np.float32), zero[..., None], alone, usual)[..., 0]
-    np.testing.assert_allclose(told["scored"], scored, rtol=1e-4, atol=1e-5)
+    signal = mitigation.signal(Evidence(world.task.reward[cells, ends], zero, here), statistics)
+    np.testing.assert_allclose(given["reward"], signal.reward, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(given["weight"], np.broadcast_to(signal.sample_weight, cells.shape), atol=1e-6)
+    alone = here.map(lambda x: x[:, :, None])
+    scores = mitigation.score(np.ones((*cells.shape, 1), np.float32), zero[..., None], alone, statistics)[..., 0]
+    np.testing.assert_allclose(given["scores"], scores, rtol=1e-4, atol=1e-5)
     assert feedback.count.sum() == 48
+    np.testing.assert_array_equal(feedback.by_rater.count.sum((0, 1)), [48, 48, 48])
+    np.testing.assert_array_equal(feedback.raters, 3 * (feedback.count > 0))
 
 
 def test_cpo_side_by_side_steps_as_alone():
@@ -503,17 +510,17 @@ def test_cpo_side_by_side_steps_as_alone():
 
 
 TINY = PPO(network=SMALL, envs=4, rollout=16)
-SHORT = deep.Program(episodes=40, steps=1024, walk=8)
+SHORT = Program(episodes=40, steps=1024, walk=8)
 
 
 def test_a_seed_gives_one_run_alone_or_side_by_side():
-    lanes = [jax.tree.map(jnp.asarray, deep.make_run(corridor(10), TINY, named("uard"), seed)) for seed in (3, 4)]
-    first, again, other = (train(lane, SHORT) for lane in (lanes[0], lanes[0], lanes[1]))
+    runs = [run_of(TINY, corridor(10), "uard", seed) for seed in (3, 4)]
+    first, again, other = (train(run, SHORT) for run in (runs[0], runs[0], runs[1]))
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
     assert not np.array_equal(first.log, other.log)
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *lanes)
-    both = jax.jit(jax.vmap(lambda lane: on_policy.run(lane, SHORT)))(stacked)
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *runs)
+    both = jax.jit(jax.vmap(lambda run: on_policy.train_one(run, SHORT)))(stacked)
     for i, one in enumerate((first, other)):
         np.testing.assert_array_equal(both.log[i], one.log)
         np.testing.assert_array_equal(both.steps[i], one.steps)
@@ -524,14 +531,14 @@ def test_a_seed_gives_one_run_alone_or_side_by_side():
 def test_a_reward_beyond_all_measure_is_caught():
     world = corridor(10)
     world = replace(world, task=world.task._replace(reward=world.task.reward * np.float32(1e38)))
-    out = run(TINY, world, SHORT, "uard")
-    assert deep.QUANTITIES[int(out.fault)] != "nothing"
+    out = trained(TINY, world, SHORT, "uard")
+    assert common.QUANTITIES[int(out.fault)] != "nothing"
     assert out.episodes < 40
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(out.good) if np.asarray(x).dtype.kind == "f")
 
 
 def test_values_are_read_for_all_actions():
-    out = run(TINY, corridor(10), SHORT, "uard")
+    out = trained(TINY, corridor(10), SHORT, "uard")
     mean, deviation, lowest = (np.asarray(x) for x in out.values)
     assert mean.shape == (4, 2)
     assert (deviation > 0).all()

@@ -1,4 +1,4 @@
-"""The compiled dynamics and the Gymnasium environment, written apart, agree step by step."""
+"""The compiled dynamics, the Gymnasium environment and rules written by hand agree step by step."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from uard.envs.grids.gym import TrapGridEnv
 from uard.envs.grids.trapgrid import TrapGrid
+from uard.envs.gym import Evaluation, GridEnv
 from uard.envs.tables import HiddenTruth, Task, pad, step
+
+from .by_hand import Traps
 
 SIZES = range(2, 9)
 STATES = max(SIZES) ** 2
@@ -26,26 +28,31 @@ def compiled(task: Task, truth: HiddenTruth, actions: jax.Array) -> tuple[jax.Ar
 
     def one(carry: tuple[jax.Array, jax.Array], action: jax.Array) -> tuple[Any, Any]:
         state, time = carry
-        next_observation, reward, terminated, truncated = step(task, state, time, action)
+        next_state, reward, terminated, truncated = step(task, state, time, action)
         done = terminated | truncated
         hidden = truth.reward[state, action], truth.hack[state, action], truth.goal[state, action]
-        carry = jnp.where(done, task.start, next_observation), jnp.where(done, 0, time + 1)
-        return carry, (next_observation, reward, terminated, truncated, *hidden)
+        carry = jnp.where(done, task.start, next_state), jnp.where(done, 0, time + 1)
+        return carry, (next_state, reward, terminated, truncated, *hidden)
 
     return jax.lax.scan(one, (jnp.asarray(task.start, jnp.int32), jnp.int32(0)), actions)[1]
 
 
-def on_the_host(grid: TrapGrid, actions: np.ndarray) -> list[tuple]:
-    env = TrapGridEnv(**{name: getattr(grid, name) for name in grid.__dataclass_fields__})
+def by_hand(grid: TrapGrid, actions: np.ndarray) -> list[tuple]:
+    """Follow the actions under rules written by hand, and see that the Gymnasium environment does the same."""
+    rules, env = Traps(grid), GridEnv(grid)
+    random = np.random.default_rng()  # nothing is drawn
     env.reset()
-    rows = []
+    state, time, rows = grid.start, 0, []
     for action in actions.tolist():
-        state, reward, terminated, truncated, info = env.step(action)
-        truth = info["evaluation"]
-        goal = grid.cell(state) == grid.goal
-        hidden = np.float32(truth.true_reward), truth.hack, goal
-        rows.append((state, np.float32(reward), terminated, truncated, *hidden))
+        state, reward, terminated, true_reward, hack = rules.step(state, action, random)
+        time += 1
+        truncated = not terminated and time == grid.horizon
+        seen = rules.observe(state)
+        assert env.step(action) == (seen, reward, terminated, truncated, {"evaluation": Evaluation(true_reward, hack)})
+        hidden = np.float32(true_reward), hack, state == grid.goal
+        rows.append((seen, np.float32(reward), terminated, truncated, *hidden))
         if terminated or truncated:
+            state, time = grid.start, 0
             env.reset()
     return rows
 
@@ -77,9 +84,9 @@ def grids(draw: st.DrawFn) -> TrapGrid:
 @example(TrapGrid(size=2), np.tile(np.int32([1, 3]), LENGTH // 2))
 @example(TrapGrid(size=2, horizon=2), np.tile(np.int32([1, 3]), LENGTH // 2))
 @example(TrapGrid(size=2, traps=((0, 1),), horizon=1), np.full(LENGTH, 3, np.int32))
-def test_both_tell_the_same_story(grid: TrapGrid, actions: np.ndarray):
+def test_all_three_tell_the_same_story(grid: TrapGrid, actions: np.ndarray):
     columns = compiled(pad(grid.task(), STATES), pad(grid.truth(), STATES), actions)
-    expected = zip(*on_the_host(grid, actions), strict=True)
+    expected = zip(*by_hand(grid, actions), strict=True)
     for name, got, want in zip(HEADINGS, columns, expected, strict=True):
         np.testing.assert_array_equal(got, want, err_msg=name)
 

@@ -67,14 +67,14 @@ ALL = np.ones(4)
 
 @cache
 def step(learner: DeepQ, score_fn: Any = plain, backup: Any = "greedy") -> Any:
-    """A compiled update; ``doubt`` times what the judge hears is added to the reward."""
+    """A compiled update; ``doubt`` times the sigma_m that the reward function is given is added to the reward."""
 
     def update(state: State, some: Transitions, weight: Any, doubt: Any) -> tuple[State, Any]:
-        def judge(sigma: Any) -> LearningSignal:
+        def reward_fn(sigma: Any) -> LearningSignal:
             return LearningSignal(jnp.asarray(REWARD) + doubt * sigma, weight)
 
-        after, watched = learner.update(state, some, judge, score_fn, plain, backup, KEY)
-        return after, watched.loss
+        after, info = learner.update(state, some, reward_fn, score_fn, plain, backup, KEY)
+        return after, info.loss
 
     # Level 0 of XLA's optimiser compiles fastest.
     compiled = jax.jit(update, compiler_options={"xla_backend_optimization_level": 0})
@@ -95,13 +95,11 @@ def huber(x: np.ndarray) -> np.ndarray:
 
 def loss_by_hand(learner: DeepQ, some: Transitions, best: Any = None, doubt: float = 0.0) -> np.ndarray:
     """The loss of every member and transition (N, B) in the first update, from the values alone."""
-    q, next_observation = (
-        values(learner, begun(learner), some.observation),
-        targets(learner, begun(learner), some.next_observation),
-    )
+    state = begun(learner)
+    q, next_values = values(learner, state, some.observation), targets(learner, state, some.next_observation)
     rows = np.arange(4)
     taken = q[:, rows, np.asarray(some.action)]
-    value = next_observation.max(-1) if best is None else next_observation[:, rows, best]
+    value = next_values.max(-1) if best is None else next_values[:, rows, best]
     many = len(q) > 1
     reward = REWARD + (doubt * taken.std(0, ddof=1) if many else 0.0)
     goal = reward + 0.9 * value * ~np.asarray(some.terminated)
@@ -126,13 +124,11 @@ def test_the_conservative_gap():
 
 
 def test_the_backup_weight():
-    next_observation = jnp.array([[1.0, 5.0], [3.0, 5.0]])  # deviations sqrt(2) and 0
+    next_values = jnp.array([[1.0, 5.0], [3.0, 5.0]])  # deviations sqrt(2) and 0
     expected = [1 / (1 + np.exp(2 * np.sqrt(2))) + 0.5, 1.0]
-    np.testing.assert_allclose(backup_weight(next_observation, 2.0), expected, rtol=1e-6)
-    np.testing.assert_array_equal(backup_weight(next_observation, 0.0), [1.0, 1.0])
-    np.testing.assert_array_equal(
-        backup_weight(next_observation[:1], 9.0), [1.0, 1.0], err_msg="one member never disagrees"
-    )
+    np.testing.assert_allclose(backup_weight(next_values, 2.0), expected, rtol=1e-6)
+    np.testing.assert_array_equal(backup_weight(next_values, 0.0), [1.0, 1.0])
+    np.testing.assert_array_equal(backup_weight(next_values[:1], 9.0), [1.0, 1.0], err_msg="one never disagrees")
 
 
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -161,7 +157,7 @@ def test_the_loss(name: str):
 
 
 @pytest.mark.parametrize("name", ["dqn", "ensemble", "shared"])
-def test_the_judge_hears_the_disagreement_about_what_was_done(name: str):
+def test_the_reward_function_is_given_sigma_m_of_the_action_taken(name: str):
     learner = agent(**SETTINGS[name])
     some = batch(learner.members)
     _, loss = step(learner)(begun(learner), some, doubt=10.0)

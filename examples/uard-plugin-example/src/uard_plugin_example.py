@@ -73,18 +73,18 @@ class BellCorridor(TableEnvironment):
         """Number of cells."""
         return self.length
 
-    def task(self) -> Task:
-        """Return what an agent meets."""
+    def task(self, dtype: Any = np.float32) -> Task:
+        """Return what an agent meets, its rewards as ``dtype``."""
         cells = np.arange(self.length)
         entered = np.stack([np.maximum(cells - 1, 0), np.minimum(cells + 1, self.length - 1), cells], axis=1)
         goal = entered == self.length - 1
         reward = np.where(goal, 10.0, -0.1)
         reward[self.length // 2, 2] = self.bell
-        return Task(entered.astype(np.int32), reward.astype(np.float32), goal, np.int32(0), np.int32(self.horizon))
+        return Task(entered.astype(np.int32), reward.astype(dtype), goal, np.int32(0), np.int32(self.horizon))
 
-    def truth(self) -> HiddenTruth:
-        """Return what only the evaluation may see."""
-        task = self.task()
+    def truth(self, dtype: Any = np.float32) -> HiddenTruth:
+        """Return what only the evaluation may see, its rewards as ``dtype``."""
+        task = self.task(dtype)
         rings = np.zeros(task.reward.shape, bool)
         rings[self.length // 2, 2] = True
         worth = np.where(rings & (not self.legitimate), np.float32(-1.0), task.reward)

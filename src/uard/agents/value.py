@@ -31,7 +31,7 @@ class DeepQ:
 
     Attributes:
         network: Size and step size, the same for all deep agents.
-        ensemble: How many member_values, and of which kind.
+        ensemble: How many members, and of which kind.
         gamma: Discount in [0, 1).
         epsilon: Exploration rate of the first episode; every episode multiplies it by ``epsilon_decay``, down to
             ``epsilon_min``.

@@ -1,7 +1,7 @@
 """What the configuration of an environment is: a frozen dataclass of one of three kinds.
 
-The kind says what an agent can be trained with (``uard.training.trainers``): tables, a compiled world, or a simulator that
-runs on the host.
+The kind says what an agent can be trained with (``uard.training.trainers``): tables, a compiled world, or a simulator
+that runs on the host.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from uard import _checks
 from uard.envs.simulator import Simulator
@@ -27,11 +28,11 @@ class Environment(ABC):
 
     Attributes:
         kind: How it is run.
-        horizon: Steps per episode.
+        horizon: Steps per episode, a whole number >= 1.
     """
 
     kind: ClassVar[Kind]
-    horizon: int | None
+    horizon: Any  # a field of all subclasses; some fill it in from their other fields
 
 
 class CompiledEnvironment(Environment):
@@ -60,12 +61,12 @@ class TableEnvironment(CompiledEnvironment):
         """Number of states."""
 
     @abstractmethod
-    def task(self) -> Task:
-        """Return what an agent meets."""
+    def task(self, dtype: DTypeLike = np.float32) -> Task:
+        """Return what an agent meets, its rewards as ``dtype``: compiled programs compute in float32."""
 
     @abstractmethod
-    def truth(self) -> HiddenTruth:
-        """Return what only the evaluation may see."""
+    def truth(self, dtype: DTypeLike = np.float32) -> HiddenTruth:
+        """Return what only the evaluation may see, its rewards as ``dtype``."""
 
     def rating_law(self, panel: Panel, noise: float = 0.0) -> RatingLaw:
         """Return what a panel says of every step, (S, A, K) float32; arguments as for ``world``."""
@@ -79,9 +80,14 @@ class TableEnvironment(CompiledEnvironment):
 
 
 class SimulatedEnvironment(Environment):
-    """One that runs on the host, in several copies; its actions are continuous, within [-1, 1]."""
+    """One that runs on the host, in several copies; its actions are continuous, within [-1, 1].
+
+    Attributes:
+        steps_per_second: Of simulated time.
+    """
 
     kind: ClassVar[Kind] = "simulator"
+    steps_per_second: ClassVar[int]
     horizon: int
 
     @property

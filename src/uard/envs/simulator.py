@@ -53,6 +53,10 @@ class Simulator(ABC):
         """Return the observations of all copies, (E, features)."""
 
     @abstractmethod
+    def reset(self, i: int) -> None:
+        """Begin an episode in copy ``i``, in whatever state it is."""
+
+    @abstractmethod
     def step(self, actions: Array) -> StepResult:
         """Take one step in every copy, actions (E, D) in [-1, 1]; copies whose episode ended begin a new one.
 

@@ -1,7 +1,6 @@
 """A small decision problem as tables, and its one-step dynamics.
 
-``Task`` is what an agent meets. ``HiddenTruth`` is for evaluation only and travels apart from it: no agent,
-model of ratings or mitigation takes it as an argument.
+``Task`` is what an agent meets. ``HiddenTruth`` is for evaluation only and travels apart from it.
 """
 
 from __future__ import annotations
@@ -36,7 +35,10 @@ class Task(NamedTuple):
 
 
 class HiddenTruth(NamedTuple):
-    """What only the evaluation sees: (S, A) true reward, hack flag and arrival at the goal."""
+    """What only the evaluation sees: true reward, hack flag and arrival at the goal; (S, A), or of one step.
+
+    No agent, model of ratings or mitigation takes it as an argument.
+    """
 
     reward: Array
     hack: Array

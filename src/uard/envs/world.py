@@ -37,14 +37,6 @@ class Step(NamedTuple):
     doubt: Array
 
 
-class Evaluation(NamedTuple):
-    """What a step was really worth, whether it was a hack, whether it reached the goal: for evaluation only."""
-
-    reward: Array
-    hack: Array
-    goal: Array
-
-
 @runtime_checkable
 class World(Protocol):
     """An episodic environment with discrete actions, its panel of annotators included.
@@ -98,7 +90,7 @@ class World(Protocol):
         """Return a number of the state-action: equal ones have equal numbers; different ones rarely share one."""
         ...
 
-    def evaluate(self, state: Any, action: Array, after: Step) -> Evaluation:
+    def evaluate(self, state: Any, action: Array, after: Step) -> HiddenTruth:
         """Return what a step was really worth; for evaluation only."""
         ...
 
@@ -176,9 +168,9 @@ class TableWorld:
         """Return the number of the state-action; none share one."""
         return state * self.actions + action
 
-    def evaluate(self, state: Array, action: Array, after: Step) -> Evaluation:
+    def evaluate(self, state: Array, action: Array, after: Step) -> HiddenTruth:
         """Look the truth up."""
-        return Evaluation(*(table[state, action] for table in self.truth))
+        return HiddenTruth(*(table[state, action] for table in self.truth))
 
     def rating_law(self, state: Array, action: Array, after: Step) -> RatingLaw:
         """Look the panel's answers up."""

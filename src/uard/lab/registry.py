@@ -17,36 +17,12 @@ from uard.agents.policy import CPO, PPO, TRPO, PolicyGradient
 from uard.agents.tabular import QLearning
 from uard.agents.value import DeepQ
 from uard.envs.base import CompiledEnvironment, SimulatedEnvironment, TableEnvironment
-from uard.envs.classic.specs import Acrobot, CartPole
-from uard.envs.grids.gaming import AbsentSupervisor, BoatRace, TomatoWatering
 from uard.envs.grids.trapgrid import TrapGrid
-from uard.envs.locomotion.physics import Locomotion, Posture, Vibration
+from uard.envs.locomotion.locomotion import Locomotion
+from uard.envs.names import ENVIRONMENTS
 from uard.method import mitigations as mitigation
 from uard.method.abstention import Abstention
 from uard.training.feedback.rating_model import RatingModel
-
-ENVIRONMENTS: dict[str, Any] = {
-    "TrapGrid": TrapGrid(),
-    **{f"TrapGrid{n}": TrapGrid(size=n) for n in (6, 8, 10)},
-    **{f"TrapGrid{n}-Trap8": TrapGrid(size=n, trap_reward=8.0) for n in (6, 8, 10)},
-    **{f"TrapGrid{n}-Legitimate": TrapGrid(size=n, legitimate=True) for n in (6, 8, 10)},
-    "TrapGrid10-T100": TrapGrid(size=10, horizon=100),
-    **{
-        f"{spec.__name__}{suffix}": spec(legitimate=bool(suffix))
-        for spec in (BoatRace, TomatoWatering, AbsentSupervisor)
-        for suffix in ("", "-Legitimate")
-    },
-    **{
-        f"{name}-{region.__name__}{suffix}": Locomotion(robot, region=region(), legitimate=bool(suffix))
-        for name, robot in (("Hopper", "hopper"), ("Walker2d", "walker2d"))
-        for region in (Vibration, Posture)
-        for suffix in ("", "-Legitimate")
-    },
-    "Hopper": Locomotion("hopper", region=None),
-    "Walker2d": Locomotion("walker2d", region=None),
-    "CartPole": CartPole(),
-    "Acrobot": Acrobot(),
-}
 
 
 def deep_agents(network: Network | None = None) -> dict[str, Any]:

@@ -242,7 +242,7 @@ def answers(
 
 
 def draw(law: RatingLaw, random: np.random.Generator) -> Float[np.ndarray, "*batch K"]:
-    """Return one rating of every rater as NumPy numbers, NaN where a rater did not answer.
+    """Return one rating of every rater as NumPy numbers, NaN where a rater did not or cannot answer.
 
     Examples:
         >>> law = PANELS["colluding"].law(np.array([4.0, 0.0]), np.array([-1.0, 0.0]), np.array([True, False]))
@@ -253,7 +253,8 @@ def draw(law: RatingLaw, random: np.random.Generator) -> Float[np.ndarray, "*bat
     normal = random.standard_normal(shape)
     uniform = None if law.quirks is None else random.random((*shape, UNIFORMS))
     ratings, mask = answers(law, normal, uniform)
-    return ratings if mask is None else np.where(mask, ratings, np.nan)
+    ratings = ratings if mask is None else np.where(mask, ratings, np.nan)
+    return ratings if law.reach is None else np.where(np.asarray(law.reach)[..., None] > 0, ratings, np.nan)
 
 
 # The paper gives no numbers for the first but sigma_h = 1.247, the deviation of {-1, 2, 1}. So on a contested step its

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from uard.envs.world import Evaluation, Step
+from uard.envs.tables import HiddenTruth
+from uard.envs.world import Step
 from uard.ratings.panels import Panel, RatingLaw
 
 GRAVITY = 9.8  # m/s^2
@@ -105,9 +106,9 @@ class ClassicWorld:
         """Return 0."""
         return jnp.int32(0)
 
-    def evaluate(self, state: Array, action: Array, after: Step) -> Evaluation:
+    def evaluate(self, state: Array, action: Array, after: Step) -> HiddenTruth:
         """Repeat the observed reward; there is no hack."""
-        return Evaluation(after.reward, jnp.zeros((), bool), after.terminated & self.rules.goal)
+        return HiddenTruth(after.reward, jnp.zeros((), bool), after.terminated & self.rules.goal)
 
     def rating_law(self, state: Array, action: Array, after: Step) -> RatingLaw:
         """Return how the panel answers."""

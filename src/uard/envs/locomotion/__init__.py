@@ -1,1 +1,1 @@
-"""Robots on MuJoCo that are to run forward, and how their reward lies."""
+"""Bodies on MuJoCo: robots that are to run forward and whose reward lies, and a pendulum without a lie."""

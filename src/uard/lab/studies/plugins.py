@@ -9,7 +9,7 @@ from typing import Any
 from uard import _checks
 from uard.agents.tabular import QLearning
 from uard.envs.grids.trapgrid import paper_grid
-from uard.envs.locomotion.physics import Locomotion
+from uard.envs.locomotion.locomotion import Locomotion
 from uard.lab import registry as names
 from uard.lab.cell import Cell
 from uard.lab.studies.common import LOCOMOTION_STEPS, PANELS

@@ -7,7 +7,8 @@ from typing import Any
 
 from uard.agents.networks import Ensemble
 from uard.agents.policy import PolicyGradient
-from uard.envs.locomotion.physics import Kick, Locomotion, Posture, Vibration
+from uard.envs.locomotion.locomotion import Kick, Locomotion
+from uard.envs.locomotion.regions import Posture, Vibration
 from uard.lab.cell import Cell
 from uard.lab.registry import continuous_agents
 from uard.lab.studies.common import LOCOMOTION_STEPS, PANELS, RAW

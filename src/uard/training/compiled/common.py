@@ -11,7 +11,8 @@ import numpy as np
 from jax import Array, lax
 
 from uard.agents.networks import batched_index
-from uard.envs.world import Evaluation, Step, TableWorld, World
+from uard.envs.tables import HiddenTruth
+from uard.envs.world import Step, TableWorld, World
 from uard.method.mitigations import Feedback, Mitigation
 from uard.ratings.aggregate import aggregate, from_rows, nothing
 from uard.ratings.panels import UNIFORMS, answers
@@ -197,7 +198,7 @@ class FeedbackSource:
         return nothing(shape, self.world.raters, jnp, jnp.float32)
 
 
-def counted(evaluation: Evaluation, after: Step) -> Array:
+def counted(evaluation: HiddenTruth, after: Step) -> Array:
     """Return what a step adds to its episode's row of the log, (len(LOG),)."""
     adds = [evaluation.hack, evaluation.reward, after.reward, evaluation.goal, 1.0, 0.0]
     return jnp.stack([jnp.asarray(x, jnp.float32) for x in adds])

@@ -3,7 +3,7 @@
 No step comes twice, so there are no running means. ``Reservoir`` is a uniform sample of all steps rated so far (it must
 not forget what honest steps look like when the agent no longer takes them); ``TransitionModel`` regresses each rater's
 rating, and how far apart the raters are, on (s, a, s', observed reward). sigma_h of a step is composed at use from the
-predicted ratings and the reward that was observed, which tells hacks apart far better than a predicted spread. The
+predicted ratings and the reward that was observed, which tells hacks apart far better than a predicted deviation. The
 lowest rating is that of the rater who is predicted to say least: what the lowest of several noisy ratings is on average
 sinks with the noise, and an agent that can end its episode then prefers to fall.
 
@@ -181,7 +181,7 @@ def soft_threshold(differences: Array, deviations: float) -> Array:
 def read(spec: TransitionModel, model: Model, inputs: Array, raters: int) -> Feedback:
     """Predict the feedback of steps (B, width); ``proxy`` is the reward that was observed.
 
-    ``count`` is how many ratings the prediction is worth, as in ``feedback.learned``.
+    ``count`` is how many ratings the prediction is worth, as in ``rating_model.read``.
     """
     x = _normal(model, inputs)
     out = _predict(spec, model.layers, model.prior, x)

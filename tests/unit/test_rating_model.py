@@ -13,23 +13,24 @@ import pytest
 from uard._checks import InvalidValueError
 from uard.envs.grids.trapgrid import paper_grid
 from uard.envs.world import TableWorld
-from uard.method.mitigations import Feedback
-from uard.training.feedback import rating_model as learned
-from uard.training.feedback import running
+from uard.method.feedback import ByRater, Feedback
+from uard.ratings.aggregate import aggregate, from_rows, to_rows
+from uard.ratings.panels import PANELS
+from uard.training.feedback import rating_model
 from uard.training.feedback.rating_model import Memory, Model, RatingModel
 
 SLOTS = 7
 
 
-def heard(steps: int, share: float) -> tuple[Memory, list[dict[str, Any]]]:
+def remembered(steps: int, share: float) -> tuple[Memory, list[dict[str, Any]]]:
     """Remember random steps, some of them rated; return the memory and the rated steps."""
     rng = np.random.default_rng(0)
-    known = learned.memory(SLOTS, {"place": jnp.zeros(2, jnp.int32)})
-    remember = jax.jit(learned.remember)
+    known = rating_model.memory(SLOTS, {"place": jnp.zeros(2, jnp.int32)}, raters=3)
+    remember = jax.jit(rating_model.remember)
     kept = []
     for _ in range(steps):
         slot = int(rng.integers(SLOTS - 1))  # the last one is never met
-        distribution = np.float32(rng.normal(size=3))
+        ratings = np.float32(rng.normal(size=3))
         rated = float(rng.random() < share)
         state = {"place": jnp.asarray([slot // 2, 5], jnp.int32)}
         known = remember(
@@ -37,59 +38,60 @@ def heard(steps: int, share: float) -> tuple[Memory, list[dict[str, Any]]]:
             jnp.int32(slot),
             state,
             jnp.int32(slot % 2),
-            running.summarise(jnp.asarray(distribution), 0),
-            jnp.float32(distribution[0] + 1),
+            aggregate(jnp.asarray(ratings), jnp.float32(ratings[0] + 1)),
             jnp.float32(rated),
         )
         if rated:
-            kept.append({"slot": slot, "said": distribution, "proxy": distribution[0] + 1})
+            kept.append({"slot": slot, "ratings": ratings, "proxy": ratings[0] + 1})
     return known, kept
 
 
 def test_memory_keeps_the_means_of_every_slot():
-    known, kept = heard(60, 0.6)
+    known, kept = remembered(60, 0.6)
     for slot in range(SLOTS):
         mine = [k for k in kept if k["slot"] == slot]
-        count, *means = np.asarray(known.rows[slot])
-        assert count == len(mine)
+        feedback = jax.tree.map(np.asarray, from_rows(known.rows[slot]))
+        assert feedback.count == len(mine)
+        assert feedback.raters == (3 if mine else 0)
         if mine:
-            distribution = np.stack([k["said"] for k in mine])
-            expected = [
-                distribution.mean(),
-                distribution.min(1).mean(),
-                distribution.std(1).mean(),
-                np.mean([k["proxy"] for k in mine]),
-            ]
-            np.testing.assert_allclose(means, expected, rtol=1e-4, atol=1e-5)
+            ratings = np.stack([k["ratings"] for k in mine])
+            proxy = np.mean([k["proxy"] for k in mine])
+            expected = [ratings.mean(), ratings.min(1).mean(), ratings.std(1).mean(), proxy]
+            np.testing.assert_allclose(feedback[1:5], expected, rtol=1e-4, atol=1e-5)
+            np.testing.assert_array_equal(feedback.by_rater.count, 3 * [len(mine)])
+            np.testing.assert_allclose(feedback.by_rater.mean, ratings.mean(0), rtol=1e-4, atol=1e-5)
+            np.testing.assert_allclose(feedback.by_rater.m2, len(mine) * ratings.var(0), rtol=1e-4, atol=1e-5)
             assert known.actions[slot] == slot % 2
             np.testing.assert_array_equal(known.states["place"][slot], [slot // 2, 5])
     assert not np.asarray(known.rows[SLOTS - 1]).any()
 
 
 def test_order_lists_the_rated_slots_once():
-    known, kept = heard(60, 0.6)
+    known, kept = remembered(60, 0.6)
     first = list(dict.fromkeys(k["slot"] for k in kept))
     assert int(known.rated) == len(first) == SLOTS - 1
     np.testing.assert_array_equal(known.order[: len(first)], first)
 
 
 def test_what_is_not_rated_is_not_remembered():
-    known, _ = heard(20, 0.0)
-    empty = learned.memory(SLOTS, {"place": jnp.zeros(2, jnp.int32)})
+    known, _ = remembered(20, 0.0)
+    empty = rating_model.memory(SLOTS, {"place": jnp.zeros(2, jnp.int32)}, raters=3)
     jax.tree.map(np.testing.assert_array_equal, known, empty)
 
 
 SPEC = RatingModel()
-WORLD = paper_grid(10).world()  # 100 states, no padding
+WORLD = paper_grid(10).world(PANELS["main"])  # 100 states, no padding
 RATERS, STATES, ACTIONS = WORLD.raters, WORLD.features, WORLD.actions
 HALF = np.arange(STATES * ACTIONS) // ACTIONS % 2 == 0  # every second state
 
 
 def rated_world(slots: np.ndarray) -> Memory:
-    """A memory in which the panel was heard without noise about some slots."""
-    centre = np.asarray(WORLD.distribution.centre, float).reshape(-1, RATERS)
+    """A memory in which the panel has rated some slots five times, without noise."""
+    centre = np.asarray(WORLD.law.centre, float).reshape(-1, RATERS)
     proxy = np.asarray(WORLD.task.reward).reshape(-1)
-    rows = np.stack([5 + 0 * proxy, centre.mean(1), centre.min(1), centre.std(1), proxy], 1) * slots[:, None]
+    visit = aggregate(centre, proxy.astype(float))
+    five = ByRater(5 * visit.by_rater.count, centre, 0 * centre)
+    rows = to_rows(visit._replace(count=5 * visit.count, by_rater=five)) * slots[:, None]
     which = np.flatnonzero(slots)
     order = np.zeros(len(slots), np.int32)
     order[: len(which)] = np.random.default_rng(0).permutation(which)
@@ -102,11 +104,13 @@ def rated_world(slots: np.ndarray) -> Memory:
 def fitted() -> Any:
     def fit(world: TableWorld, known: Memory, chunks: Any) -> tuple[Model, Feedback]:
         def once(i: Any, model: Model) -> Model:
-            return learned.fit(SPEC, model, known, world.observe, ACTIONS, jax.random.fold_in(jax.random.key(1), i))
+            return rating_model.fit(
+                SPEC, model, known, world.observe, ACTIONS, jax.random.fold_in(jax.random.key(1), i)
+            )
 
-        model = learned.init(SPEC, jax.random.key(0), STATES, ACTIONS)
+        model = rating_model.init(SPEC, jax.random.key(0), STATES, ACTIONS)
         model = jax.lax.fori_loop(0, chunks, once, model)
-        return model, learned.read(SPEC, model, jnp.eye(STATES), ACTIONS, RATERS)
+        return model, rating_model.read(SPEC, model, jnp.eye(STATES), ACTIONS, RATERS)
 
     return jax.jit(fit)
 
@@ -122,11 +126,11 @@ def error(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_predictions_approach_what_the_panel_says():
-    centre = np.asarray(WORLD.distribution.centre)
+    centre = np.asarray(WORLD.law.centre)
     truth = centre.mean(-1), centre.min(-1), centre.std(-1), WORLD.task.reward
     _, early = read_after(5)
     _, late = read_after(200)
-    for name, expected in zip(("mean", "lowest", "spread", "proxy"), truth, strict=True):
+    for name, expected in zip(("mean", "lowest", "sd", "proxy"), truth, strict=True):
         before, after = error(getattr(early, name), expected), error(getattr(late, name), expected)
         unit = float(np.std(WORLD.task.reward))
         assert after < 0.15 * unit, name
@@ -134,10 +138,11 @@ def test_predictions_approach_what_the_panel_says():
     hack = np.asarray(WORLD.truth.hack)
     assert late.sd[hack].min() > 0.5 > 0.2 > np.quantile(late.sd[~hack], 0.95)
     assert (late.sd >= 0).all()
-    assert late.raters == RATERS
+    np.testing.assert_array_equal(late.raters, np.full((STATES, ACTIONS), RATERS))
+    assert late.by_rater is None, "a prediction is of the panel, not of its members"
 
 
-def test_count_says_where_ratings_were_heard():
+def test_count_is_high_where_there_were_ratings():
     _, feedback = read_after(200, "half")
     count = feedback.count.reshape(-1)
     yes, no = count[HALF], count[~HALF]
@@ -172,9 +177,7 @@ def test_a_constant_reward_has_a_unit():
     model, feedback = jax.tree.map(np.asarray, fitted()(WORLD, rated_world(one), 200))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((model, feedback)))
     np.testing.assert_array_equal(model.scale, 1.0)
-    assert (
-        abs(feedback.mean.reshape(-1)[17] - np.asarray(WORLD.distribution.centre).reshape(-1, RATERS)[17].mean()) < 0.1
-    )
+    assert abs(feedback.mean.reshape(-1)[17] - np.asarray(WORLD.law.centre).reshape(-1, RATERS)[17].mean()) < 0.1
 
 
 @pytest.mark.parametrize(
