@@ -43,7 +43,11 @@ def modules(*packages):
 
 @pytest.mark.parametrize(
     "names",
-    [*modules("adapters"), ", ".join(modules("method", "ratings", "judges", "diagnosis")), "uard.cli.app, uard.plugins"],
+    [
+        *modules("adapters"),
+        ", ".join(modules("method", "ratings", "judges", "diagnosis")),
+        "uard.cli.app, uard.plugins",
+    ],
 )
 def test_all_but_the_laboratory_is_imported_without_jax(names):
     code = f"import sys, warnings; warnings.simplefilter('ignore'); import {names}"  # others' warnings are theirs

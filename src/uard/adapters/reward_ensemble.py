@@ -83,13 +83,13 @@ class RewardEnsemble:
         return np.einsum("nbf,nf->nb", self._features(observations, actions), self._prior + self._weights)
 
     def update(self, observations: Any, actions: Any, rewards: Float[np.ndarray, " B"]) -> None:
-        """Learn from a batch of steps; members are solved anew after 1, 2, 4 ... 256, 512, 768 ... steps."""
+        """Learn from a batch of steps; members are fitted again after 1, 2, 4 ... 256, 512, 768 ... steps."""
         z = self._features(observations, actions)
-        often = self._random.poisson(1.0, z.shape[:2]).astype(float)
-        left = rewards - np.einsum("nbf,nf->nb", z, self._prior)
-        heavy = often[..., None] * z
-        self._gram += np.einsum("nbf,nbg->nfg", heavy, z)
-        self._moment += np.einsum("nbf,nb->nf", heavy, left)
+        times = self._random.poisson(1.0, z.shape[:2]).astype(float)  # of each step in each member's bootstrap
+        residual = rewards - np.einsum("nbf,nf->nb", z, self._prior)
+        weighted = times[..., None] * z
+        self._gram += np.einsum("nbf,nbg->nfg", weighted, z)
+        self._moment += np.einsum("nbf,nb->nf", weighted, residual)
         self._seen += len(rewards)
         if self._seen >= self._due:
             self._due = self._seen + min(self._seen, 256)

@@ -87,14 +87,14 @@ def ask(judges: Mapping[str, Judge], question: dict[str, Any]) -> dict[str, Any]
     size = len(question["completions"])
     answers: dict[str, Any] = {}
     for name, judge in judges.items():
-        with _blaming(name, size):
+        with _naming(name, size):
             answer: Any = judge(**question)
         if inspect.iscoroutine(answer):
             answer = asyncio.run_coroutine_threadsafe(answer, _event_loop(os.getpid()))
         answers[name] = answer
     for name, answer in answers.items():
         if isinstance(answer, Future):
-            with _blaming(name, size):
+            with _naming(name, size):
                 answers[name] = cast("Future[Any]", answer).result()
     return answers
 
@@ -144,7 +144,7 @@ def _name(judge: Any) -> str:
 
 
 @contextmanager
-def _blaming(name: str, size: int) -> Generator[None]:
+def _naming(name: str, size: int) -> Generator[None]:
     try:
         yield
     except Exception as error:

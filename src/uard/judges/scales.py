@@ -55,5 +55,5 @@ class Scale:
         self.count = total
 
     def ratings(self, values: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-        """Return (x - location) / deviation; NaN while the deviation is 0, when a number tells nothing."""
+        """Return (x - location) / deviation; NaN while the deviation is 0, when numbers mean nothing."""
         return (values - self.location) / (self.deviation or math.nan)

@@ -1,4 +1,4 @@
-"""What a mitigation knows of the ratings of some state-actions: each rater's, and what the panel says together."""
+"""What a mitigation knows of the ratings of some state-actions: each rater's, and the panel's together."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Feedback(NamedTuple):
         sd: Mean over rated visits of the raters' standard deviation: sigma_h.
         proxy: Mean observed reward of the rated visits.
         raters: Number of raters who have rated here.
-        by_rater: The ratings of each rater; None where a model has predicted what the panel says together.
+        by_rater: The ratings of each rater; None where a model has predicted the panel's ratings together.
     """
 
     count: Float[Array, "*batch"]

@@ -102,7 +102,7 @@ class RewardStream:
             abstention: See the attribute.
             ddof: Of sigma_h.
             capacity: Rated steps kept where steps have no keys, >= 2.
-            refresh: Rated steps after which the panel's statistics are measured anew, >= 1 (more often at first).
+            refresh: Rated steps after which the panel's statistics are measured again, >= 1 (more often at first).
             seed: Of the sample of steps that are kept.
 
         Raises:
@@ -225,7 +225,7 @@ class RewardStream:
         return self._table[slots]
 
     def _measured(self, keyed: bool) -> Any:
-        """Return the panel's statistics, measured anew when enough has been rated since."""
+        """Return the panel's statistics, measured again when enough has been rated since."""
         if self.rated >= self._due:
             self._statistics.clear()
             self._due = self.rated + max(1, min(self.rated, self._refresh))

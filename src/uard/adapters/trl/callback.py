@@ -90,7 +90,7 @@ class ReliabilityCallback(TrainerCallback):
         else:
             warnings.warn(
                 f"training is resumed at step {state.global_step}, but {file} does not exist: the judges' scales and "
-                "their mean disagreement are measured anew",
+                "their mean disagreement start again from nothing",
                 ForgottenWarning,
                 stacklevel=2,
             )
@@ -102,7 +102,7 @@ class ReliabilityCallback(TrainerCallback):
         file.write_bytes(pickle.dumps(self.reward.memory))
 
     def on_step_end(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
-        """Look for what deserves a warning."""
+        """Warn, if there is reason to."""
         tally = self.reward.tally
         if tally.completions == 0:
             self._warn(
@@ -132,7 +132,7 @@ class ReliabilityCallback(TrainerCallback):
         log.info("%s", self.report())
 
     def report(self) -> str:
-        """Return what has been seen so far, for people."""
+        """Return a summary of all completions so far, as text."""
         tally = self.reward.tally
         scored = tally.completions - tally.unscored
         lines = [

@@ -5,9 +5,9 @@ TRL adds the reward functions of a list up, so their disagreement is lost. Here 
     reward = UncertaintyDiscountedReward([relevance, clarity, RewardModel(model, tokenizer)])
     trainer = GRPOTrainer(..., reward_funcs=reward, callbacks=[ReliabilityCallback(reward)])
 
-**What normalisation leaves of the discount.** A completion earns b + w (r - b): r is what the judges say together, b
+**What normalisation leaves of the discount.** A completion earns b + w (r - b): r is the judges' weighted mean, b
 the lowest of them, w how far r is believed. Trainers compare the completions of one prompt, so what *differs* among
-them survives: a contested completion falls behind its siblings. What they share does not:
+them survives: a contested completion falls behind the others. What they share does not:
 
 * a *shift*, the same w and r - b for all completions of a prompt, is always lost with the mean of the group: judges
   who disagree about the prompt only, by the same amount for each completion, change nothing;

@@ -10,7 +10,7 @@ A log is a table with one row per step (or per completion, or per item that was 
 * ``episode``, ``step``: names of the row in messages.
 
 Other columns are left alone. Rows are counted from 1, without the header. ``nan``, ``na``, ``n/a``, ``null``, ``none``
-and nothing mean that a number is missing. NaN and infinity are read as they are: it is the doctor that speaks of them.
+and nothing mean that a number is missing. NaN and infinity are read as they are: the doctor reports them.
 """
 
 from __future__ import annotations
