@@ -2,7 +2,7 @@
 
 Trains the example examples/grpo_three_judges.py in every way below. "over training" is the mean over all completions,
 "at the end" over those of the last five steps; mean and standard deviation over seeds. Under each way with a discount:
-how far it changes the advantages (see uard.adapters.trl.reward.advantage_change), and how many groups are discounted.
+how far it changes the advantages (see uard.adapters.trl.advantage_change), and how many groups are discounted.
 """
 
 import argparse

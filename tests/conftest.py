@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import shapes  # noqa: F401  isort: skip  (checks the arrays of what is imported of uard after it)
 import uard.training  # noqa: F401  isort: skip  (sets XLA's flags, which must come before the first use of JAX)
 import jax
 import jax.numpy as jnp

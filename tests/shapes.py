@@ -1,8 +1,11 @@
 """Checks array shapes while the tests run: signatures written with jaxtyping are contracts.
 
-``install`` wraps the functions and methods of some packages as they are imported. A call whose arrays have other shapes
-or types than the signature says must end in an error of the function's own; if it returns, or if what it returns has
-another shape, the test fails.
+Once this is imported, functions and methods of ``PACKAGES`` are wrapped as they are imported. A call whose arrays have
+other shapes or types than the signature says must end in an error of the function's own. If it returns all the same, or
+if what it returns has another shape, ``ShapeError`` is raised. The fields of named tuples that come or go are checked
+too.
+
+(jaxtyping's import hook cannot do this: it would refuse a call before our own errors, which the tests are about.)
 """
 
 from __future__ import annotations
@@ -14,84 +17,128 @@ import inspect
 import sys
 import types
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from typing import Any
 
-from beartype import beartype
-from jaxtyping import AbstractArray, TypeCheckError, jaxtyped
+import jaxtyping
+from beartype import BeartypeConf
+from beartype.door import is_bearable
+
+PACKAGES = ("uard.method", "uard.ratings", "uard.judges", "uard.diagnosis", "uard.adapters")
+INTS_ARE_FLOATS = BeartypeConf(is_pep484_tower=True)
 
 
-def install(packages: Sequence[str]) -> None:
-    """Wrap what is imported of these packages from now on."""
-    early = [name for name in sys.modules if name.startswith(tuple(f"{p}." for p in packages))]
-    assert not early, f"imported before they could be wrapped: {early}"
-    sys.meta_path.insert(0, _Finder(tuple(packages)))
+class ShapeError(AssertionError):
+    """A function took or returned an array of another shape or type than its signature says."""
 
 
 class _Finder(importlib.abc.MetaPathFinder):
-    def __init__(self, packages: tuple[str, ...]):
-        self.packages = packages
-
-    def find_spec(self, name: str, path: Any, target: Any = None) -> Any:
-        if not any(name == p or name.startswith(f"{p}.") for p in self.packages):
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> Any:
+        if not fullname.startswith(PACKAGES):
             return None
-        spec = importlib.machinery.PathFinder.find_spec(name, path, target)
+        spec = importlib.machinery.PathFinder.find_spec(fullname, path, target)
         if spec is not None and isinstance(spec.loader, importlib.machinery.SourceFileLoader):
-            spec.loader = _Loader(name, spec.loader.path)
+            spec.loader = _Loader(fullname, spec.loader.path)
         return spec
 
 
 class _Loader(importlib.machinery.SourceFileLoader):
     def exec_module(self, module: types.ModuleType) -> None:
         super().exec_module(module)
-        for owner, name, function in list(_functions(module)):
-            checked = _checked(function)
-            if checked is not None:
-                setattr(owner, name, checked)
+        classes = [c for c in vars(module).values() if inspect.isclass(c) and c.__module__ == module.__name__]
+        for owner in (module, *classes):
+            for name, value in list(vars(owner).items()):
+                if inspect.isfunction(value) and value.__module__ == module.__name__:
+                    setattr(owner, name, checked(value))
 
 
-def _functions(module: types.ModuleType) -> Iterator[tuple[Any, str, Callable[..., Any]]]:
-    for owner in (
-        module,
-        *(c for c in vars(module).values() if inspect.isclass(c) and c.__module__ == module.__name__),
-    ):
-        for name, value in vars(owner).items():
-            if inspect.isfunction(value) and value.__module__ == module.__name__:
-                yield owner, name, value
-
-
-def _checked(function: Any) -> Callable[..., Any] | None:
-    """Return the function with its array annotations checked; None if it has none."""
-    arrays = {name: hint for name, hint in _hints(function).items() if _has_shape(hint)}
-    if not arrays:
-        return None
-    twin = types.FunctionType(function.__code__, function.__globals__, function.__name__, None, function.__closure__)
-    twin.__defaults__, twin.__kwdefaults__ = function.__defaults__, function.__kwdefaults__
-    twin.__annotations__, twin.__qualname__, twin.__module__ = arrays, function.__qualname__, function.__module__
-    strict = jaxtyped(typechecker=beartype)(twin)
+def checked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function, checked after each call that returns; itself if its signature says nothing of shapes."""
+    hints = _hints(function.__annotations__, function.__globals__)
+    if not hints:
+        return function
+    parameters = function.__code__.co_varnames[: function.__code__.co_argcount]
+    known: set[Any] = set()  # what has been found right need not be checked again
 
     @functools.wraps(function)
     def wrapper(*args: Any, **options: Any) -> Any:
-        try:
-            return strict(*args, **options)
-        except TypeCheckError as violation:
-            function(*args, **options)  # its own error, which says more, is what a user would see
-            raise violation
+        result = function(*args, **options)
+        values = dict(zip(parameters, args, strict=False), **options) | {"return": result}
+        values = {name: values[name] for name in hints if name in values}
+        kinds = tuple((name, _kind(value)) for name, value in values.items())
+        if kinds not in known:
+            _check(function.__qualname__, values, hints)
+            known.add(kinds)
+        return result
 
     return wrapper
 
 
-def _hints(function: Any) -> dict[str, Any]:
+def _kind(value: Any) -> Any:
+    """Return all of a value that its checks depend on."""
+    if hasattr(value, "dtype"):
+        return type(value), tuple(value.shape), value.dtype
+    return tuple(map(_kind, value)) if isinstance(value, tuple) else type(value)
+
+
+def _check(where: str, values: dict[str, Any], hints: dict[str, Any]) -> None:
+    with jaxtyping.jaxtyped("context"):  # in which one name is one size
+        _check_each(where, values, hints)
+    for name, value in values.items():
+        if _fields(type(value)):  # its names are names of its own
+            with jaxtyping.jaxtyped("context"):
+                _check_fields(f"{where}: {name}", value)
+
+
+def _check_each(where: str, values: dict[str, Any], hints: dict[str, Any]) -> None:
+    for name, value in values.items():
+        if not is_bearable(value, hints[name], conf=INTS_ARE_FLOATS):
+            others = ", ".join(f"{n} {_text(v)}" for n, v in values.items() if n != name)
+            raise ShapeError(f"{where}: {name} is {_text(value)}, not {_text(hints[name])}; with {others}")
+
+
+def _check_fields(where: str, value: Any) -> None:
+    fields = _fields(type(value))
+    values = {name: getattr(value, name) for name in fields}
+    _check_each(where, values, fields)
+    for name, field in values.items():
+        if _fields(type(field)):
+            _check_fields(f"{where}.{name}", field)
+
+
+def _text(value: Any) -> str:
+    if inspect.isclass(value):
+        return value.__name__
+    return f"{value.dtype}{list(value.shape)}" if hasattr(value, "dtype") else repr(value)[:80]
+
+
+@functools.cache
+def _fields(kind: type) -> dict[str, Any]:
+    """Return what a named tuple's fields must be; nothing for other classes."""
+    if not (issubclass(kind, tuple) and hasattr(kind, "_fields")):
+        return {}
+    annotations = {name: getattr(hint, "__forward_arg__", hint) for name, hint in kind.__annotations__.items()}
+    return _hints(annotations, vars(sys.modules[kind.__module__]))
+
+
+def _hints(annotations: dict[str, Any], names: dict[str, Any]) -> dict[str, Any]:
+    """Return those annotations that are shapes, or named tuples in which there are some."""
     hints = {}
-    for name, text in function.__annotations__.items():
-        try:
-            hints[name] = eval(text, function.__globals__) if isinstance(text, str) else text
-        except (NameError, AttributeError):  # imported for the type checker only
+    for name, text in annotations.items():
+        try:  # jaxtyping's names are imported for the type checker only
+            hint = eval(text, vars(jaxtyping) | names) if isinstance(text, str) else text
+        except NameError:  # as others are
             continue
+        if _has_shape(hint):
+            hints[name] = hint
     return hints
 
 
 def _has_shape(hint: Any) -> bool:
-    if inspect.isclass(hint) and issubclass(hint, AbstractArray):
-        return True
+    if inspect.isclass(hint) and not typing.get_args(hint):
+        return issubclass(hint, jaxtyping.AbstractArray) or bool(_fields(hint))
     return any(_has_shape(part) for part in typing.get_args(hint))
+
+
+assert not any(name.startswith(PACKAGES) for name in sys.modules), "imported before they could be wrapped"
+sys.meta_path.insert(0, _Finder())

@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from uard._support import moved
 from uard._version import __version__
 
 if TYPE_CHECKING:
@@ -59,6 +60,8 @@ __all__ = [
     "sigma_model",
     "total_uncertainty",
 ]
+
+moved.install()
 
 
 def __getattr__(name: str) -> Any:

@@ -6,9 +6,12 @@ import difflib
 import math
 import sys
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+
+
+T = TypeVar("T")
 
 
 class InvalidValueError(ValueError):
@@ -55,6 +58,13 @@ def choose(field: str, value: str, known: Iterable[str]) -> str:
     return value
 
 
+def instance(field: str, value: object, kind: type[T], allowed: str) -> T:
+    """Return ``value`` if it is of a class; else the error says what is ``allowed``."""
+    if not isinstance(value, kind):
+        raise InvalidValueError(field, value, allowed)
+    return value
+
+
 def number(
     field: str,
     value: Any,
@@ -69,13 +79,19 @@ def number(
 
     Values that are being traced by JAX pass unchecked: they were checked before tracing.
     """
+    if type(value) is float and low < value <= high and value < math.inf:
+        return  # nearly always
     if is_traced(value):
         return
-    plain = value.item() if getattr(value, "shape", None) == () else value
+    plain = _plain(value)
     good = isinstance(plain, int | float | np.floating) and not isinstance(plain, bool)
     good = good and abs(plain) <= sys.float_info.max and low <= plain <= high and not (open_low and plain == low)
     if not good:
         raise InvalidValueError(field, value, _interval("a finite number", low, high, open_low))
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if getattr(value, "shape", None) == () else value
 
 
 def whole(field: str, value: Any, *, low: int = 0, high: float = math.inf) -> None:

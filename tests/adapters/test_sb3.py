@@ -122,6 +122,15 @@ def test_a_buffer_of_several_environments_keeps_rewards_where_they_belong():
     assert buffer._raw[:10].max() == 70.0
 
 
+def test_a_key_of_the_buffer_sees_the_whole_observation():
+    spaces = gymnasium.spaces.Box(-1.0, 1.0, (2,)), gymnasium.spaces.Discrete(2)
+    buffer = ReliabilityReplayBuffer(4, *spaces, mitigation=RatedReward(), key=lambda state, action: (*state, action))
+    for y, rating in ((0.0, -1.0), (1.0, 3.0)):  # two states that differ in their second coordinate
+        state = np.array([[0.5, y]], np.float32)
+        buffer.add(state, state, np.array([[1]]), np.array([2.0]), np.array([False]), [{"ratings": [rating]}])
+    assert buffer._get_samples(np.array([0, 1])).rewards.ravel().tolist() == [-1.0, 3.0]
+
+
 def test_sac_lends_its_critics_and_takes_them_back(tmp_path):
     env = make_vec_env("uard/Hopper-Posture-v0", 1, seed=0, env_kwargs={"panel": "appendix"})
     model = SAC(

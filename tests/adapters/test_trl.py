@@ -264,7 +264,7 @@ def test_a_judge_that_raises_is_named(judge):
     ("answer", "message"),
     [
         ([1.0], "number of scores of judge 'bad' = 1: must be 2, one per completion"),
-        (None, "what judge 'bad' gave = None: must be a list of 2 numbers"),
+        (None, "answer of judge 'bad' = None: must be a list of 2 numbers"),
         (np.float64(3), "number of scores of judge 'bad' = 3.0: must be 2"),
         ([1.0, "good"], "score 1 of judge 'bad' = 'good': must be a finite number, or None or NaN"),
         ([1.0, [2.0]], r"score 1 of judge 'bad' = \[2.0\]"),
@@ -293,7 +293,7 @@ def test_numbers_of_all_kinds(answer):
     [
         ([-1.0, 1.0], r"sigma_m\[0\] = -1.0: must be finite and >= 0"),
         ([[0.0, 1.0], [0.0, np.nan]], r"sigma_m\[1, 1\] = nan"),
-        ([[1.0], [1.0]], r"shape of what sigma_m gave = \(2, 1\): must be \(2,\) or \(2, N\) with N >= 2"),
+        ([[1.0], [1.0]], r"shape of the answer of sigma_m = \(2, 1\): must be \(2,\) or \(2, N\) with N >= 2"),
         (None, "sigma_m"),
     ],
 )
@@ -487,10 +487,10 @@ def test_the_reward_needs_neither_trl_nor_torch():
 
 
 def test_other_names_do_not_resolve():
-    import uard.adapters.trl.reward
+    import uard.adapters.trl
 
     with pytest.raises(AttributeError, match="has no attribute 'nonsense'"):
-        uard.adapters.trl.reward.nonsense  # noqa: B018
+        uard.adapters.trl.nonsense  # noqa: B018
 
 
 def test_pickling_keeps_all_that_is_known():

@@ -181,7 +181,8 @@ def test_only_the_recommended_form_keeps_the_order_of_rewards(change, name, keep
 
 @pytest.mark.parametrize("form", FORMS)
 def test_scores_prefer_the_less_doubtful_of_two_equal_actions_unless_unanchored_and_negative(form):
-    feedback = Feedback(*(np.ones(3), np.zeros(3), np.zeros(3), np.array([0.0, 2.0, 0.0]), np.zeros(3)), np.array(3.0))
+    none = np.zeros(3)
+    feedback = Feedback(np.ones(3), none, none, sd=np.array([0.0, 2.0, 0.0]), proxy=none, raters=np.full(3, 3.0))
     mu = np.array([-1.0, -1.0, -5.0])
     printed = named("uard-paper", form=form)
     anchored = named("uard-paper", form=form, anchor="lowest")

@@ -18,7 +18,6 @@ from uard.envs.gym import GridEnv, make
 from uard.ratings.panels import (
     APPENDIX,
     COLLUDING,
-    DESCRIPTIONS,
     MAIN,
     PANELS,
     SINGLE,
@@ -60,7 +59,7 @@ def drawn(rater: Rater, count: int = 20_000, **step: Any) -> np.ndarray:
 
 
 def test_every_panel_rates_every_step():
-    assert set(PANELS) == set(RATERS) == set(DESCRIPTIONS)
+    assert set(PANELS) == set(RATERS)
     assert tuple(PANELS.values()) == (MAIN, APPENDIX, COLLUDING, SINGLE)
     for name, raters in RATERS.items():
         centre, deviation, _ = law_of(PANELS[name])

@@ -1,11 +1,8 @@
 import math
 from statistics import stdev
 
-import krippendorff
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy import stats
 
 from uard import InvalidValueError
@@ -227,37 +224,3 @@ def test_false_alarms_are_as_rare_as_they_should_be():
 
 def test_resamples_are_shared_by_equal_sizes():
     assert statistics._resampled(10) is statistics._resampled(10)
-
-
-@pytest.mark.parametrize(
-    ("ratings", "alpha"),
-    [
-        ([[1, 1], [2, 2], [3, 3]], 1.0),
-        ([[0, 1], [1, 0]], -0.5),  # n = 4, S = 1, S_u = 1/2 each: 1 - 3/4 (2 (2 * 1/2)) / 1
-        ([[0, 1], [0, 1], [np.nan, 7]], -0.5),  # a row with one rating says nothing of agreement
-        ([[1, 1], [1, 1]], None),
-        ([[1, np.nan], [np.nan, 2]], None),
-        (np.zeros((5, 0)), None),
-    ],
-)
-def test_krippendorff_alpha_by_hand(ratings, alpha):
-    got = statistics.krippendorff_alpha(ratings)
-    assert got is None if alpha is None else got == pytest.approx(alpha)
-
-
-@given(st.integers(0, 10_000), st.integers(2, 5), st.integers(2, 12))
-@settings(max_examples=50, deadline=None)
-def test_krippendorff_alpha_is_that_of_the_package(seed, raters, rows):
-    random = np.random.default_rng(seed)
-    ratings = random.integers(0, 4, (rows, raters)).astype(float)
-    ratings[random.random(ratings.shape) < 0.2] = np.nan
-    ours = statistics.krippendorff_alpha(ratings)
-    if ours is not None:
-        assert ours == pytest.approx(krippendorff.alpha(ratings.T, level_of_measurement="interval"))
-
-
-def test_krippendorff_alpha_refuses_nonsense():
-    with pytest.raises(InvalidValueError, match=r"ratings.shape = \(3,\)"):
-        statistics.krippendorff_alpha([1.0, 2.0, 3.0])
-    with pytest.raises(InvalidValueError, match="ratings"):
-        statistics.krippendorff_alpha([[1.0, np.inf], [1.0, 2.0]])

@@ -96,7 +96,7 @@ def test_the_sample_of_steps_without_keys_is_uniform_and_bounded():
     stream = RewardStream(capacity=50, seed=3)
     for i in range(100):
         stream(np.full(10, float(i)), np.full((10, 2), float(i)))
-    kept = stream._sample.feedback(0).proxy
+    kept = stream._sample.feedback().proxy
     assert stream.rated == 1000
     assert len(kept) == 50
     # Uniform over 0..99: mean 49.5, deviation of the mean of 50 is 4.1.

@@ -1,13 +1,5 @@
 """The filter as a Gymnasium wrapper.
 
-    >>> import gymnasium, uard.envs
-    >>> from uard.adapters.gymnasium import ReliabilityWrapper
-    >>> env = ReliabilityWrapper(gymnasium.make("uard/TrapGrid6-v0", panel="main"))
-    >>> observation, info = env.reset(seed=0)
-    >>> observation, reward, terminated, truncated, info = env.step(3)
-    >>> sorted(set(info) & {"raw_reward", "weight", "sigma_h"})
-    ['raw_reward', 'sigma_h', 'weight']
-
 Order matters (stable-baselines3#146): what wraps this wrapper sees filtered rewards, what it wraps sees raw ones. So a
 ``RecordEpisodeStatistics`` or ``Monitor`` outside logs what the agent learns from; both returns of an episode are in
 the ``info`` of its last step (``raw_return``, ``filtered_return``); ``Monitor(info_keywords=...)`` writes them down.
@@ -15,16 +7,19 @@ the ``info`` of its last step (``raw_return``, ``filtered_return``); ``Monitor(i
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from uard.adapters.steps import INFO, KeyFn, RatingsFn, SigmaFn, Steps, natural_key, rows_of, subset
+from uard.adapters.steps import INFO, KeyFn, RatingsFn, SigmaFn, Steps, map_batch, natural_key, rows_of, subset
 from uard.method.abstention import Abstention
 from uard.method.mitigations import Mitigation
 from uard.ratings.stream import RewardStream
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Integer, Shaped
 
 
 def _steps(
@@ -43,6 +38,14 @@ def _steps(
 class ReliabilityWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
     """Emits filtered rewards; wraps single and vector environments (for those it is ``VectorReliabilityWrapper``).
 
+    Examples:
+        >>> import uard.envs
+        >>> env = ReliabilityWrapper(gymnasium.make("uard/TrapGrid6-v0", panel="main"))
+        >>> observation, info = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(3)
+        >>> sorted(set(info) & {"raw_reward", "weight", "sigma_h"})
+        ['raw_reward', 'sigma_h', 'weight']
+
     After each step ``info`` also holds ``raw_reward``, ``weight`` w, ``sigma_m``, ``sigma_h``, ``lambda_t`` and
     ``abstained``; after an episode's last step ``raw_return`` and ``filtered_return``.
 
@@ -50,10 +53,11 @@ class ReliabilityWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.
         steps: What filters; its ``stream`` is all that is remembered.
     """
 
-    def __new__(cls, env: Any = None, *args: Any, **options: Any) -> Any:  # unpickling gives none
+    def __new__(cls, *args: Any, **options: Any) -> Any:
         """Return the vector form for vector environments."""
+        env = args[0] if args else options.get("env")  # unpickling gives none
         if isinstance(env, gymnasium.vector.VectorEnv):
-            return VectorReliabilityWrapper(env, *args, **options)
+            return VectorReliabilityWrapper(*args, **options)
         return super().__new__(cls)
 
     def __init__(
@@ -74,7 +78,7 @@ class ReliabilityWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.
             mitigation: What to do with rewards; ``uard()`` if left out.
             ratings: Called with batches (observations, actions, next observations, rewards), B = 1 here.
             sigma_m: Called with batches (observations, actions); e.g. ``uard.adapters.reward_ensemble.RewardEnsemble``.
-            key: Tells state-actions apart, so that what was said of one is remembered when it comes again; found for
+            key: Tells state-actions apart, so that the ratings of one are remembered when it comes again; found for
                 numbered states and actions if left out.
             abstention: Marks steps in ``info["abstained"]``.
         """
@@ -87,7 +91,7 @@ class ReliabilityWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.
         self._returns = np.zeros(2)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; what was learned of the raters is kept."""
+        """Start an episode; all ratings are remembered."""
         self._observation, info = super().reset(seed=seed, options=options)
         self._returns[:] = 0.0
         return self._observation, info
@@ -119,6 +123,14 @@ class ReliabilityWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.
 class VectorReliabilityWrapper(gymnasium.vector.VectorWrapper, gymnasium.utils.RecordConstructorArgs):
     """The same for vector environments in all three autoreset modes; ``info`` holds arrays with their masks ``_name``.
 
+    Examples:
+        >>> import uard.envs
+        >>> env = VectorReliabilityWrapper(gymnasium.make_vec("uard/TrapGrid6-v0", num_envs=2, panel="main"))
+        >>> observations, info = env.reset(seed=0)
+        >>> observations, rewards, terminated, truncated, info = env.step(np.array([3, 1]))
+        >>> info["weight"].shape, info["_weight"].tolist()
+        ((2,), [True, True])
+
     The step that only resets (``AutoresetMode.NEXT_STEP``) is neither filtered nor remembered.
 
     Attributes:
@@ -147,7 +159,7 @@ class VectorReliabilityWrapper(gymnasium.vector.VectorWrapper, gymnasium.utils.R
         self._resetting = np.zeros(self.num_envs, bool)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start episodes (those of ``options["reset_mask"]``, if given); what was learned of the raters is kept."""
+        """Start episodes (those of ``options["reset_mask"]``, if given); all ratings are remembered."""
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)), bool).copy()
         self._observation, info = super().reset(seed=seed, options=options)
         self._returns[:, mask] = 0.0
@@ -189,19 +201,19 @@ class VectorReliabilityWrapper(gymnasium.vector.VectorWrapper, gymnasium.utils.R
         self._observation = next_observation
         return next_observation, filtered, terminated, truncated, info
 
-    def _reached(self, next_observation: Any, ended: np.ndarray, info: dict[str, Any]) -> Any:
+    def _reached(self, next_observation: Any, ended: Bool[np.ndarray, " B"], info: dict[str, Any]) -> Any:
         """Return what the steps led to, before any reset."""
         if self._mode is not AutoresetMode.SAME_STEP or not ended.any() or self.steps.ratings is None:
             return next_observation
         rows = [
             info["final_obs"][i] if ended[i] else subset(next_observation, np.array(i)) for i in range(self.num_envs)
         ]
-        space = self.single_observation_space
+        space = cast("Any", self).single_observation_space
         out = gymnasium.vector.utils.create_empty_array(space, self.num_envs)
         return gymnasium.vector.utils.concatenate(space, rows, out)
 
 
-def _reported(info: dict[str, Any], ended: np.ndarray) -> dict[int, Any]:
+def _reported(info: dict[str, Any], ended: Bool[np.ndarray, " B"]) -> dict[int, Any]:
     """Return the ratings of those environments that reported any; those that just ended did so in ``final_info``."""
     found: dict[int, Any] = {}
     for source, mine in ((info, ~ended), (info.get("final_info", {}), ended)):
@@ -211,13 +223,15 @@ def _reported(info: dict[str, Any], ended: np.ndarray) -> dict[int, Any]:
     return found
 
 
-def _put(info: dict[str, Any], name: str, places: np.ndarray, values: np.ndarray, count: int) -> None:
+def _put(
+    info: dict[str, Any], name: str, places: Integer[np.ndarray, " n"], values: Shaped[np.ndarray, " n"], count: int
+) -> None:
+    """Put the values of some of ``count`` environments into ``info``, with the mask that Gymnasium keeps of them."""
     whole, mask = np.zeros(count, values.dtype), np.zeros(count, bool)
     whole[places], mask[places] = values, True
     info[name], info[f"_{name}"] = whole, mask
 
 
 def _batch(one: Any) -> Any:
-    if isinstance(one, dict):
-        return {name: _batch(part) for name, part in one.items()}
-    return tuple(_batch(part) for part in one) if isinstance(one, tuple) else np.asarray(one)[None]
+    """Return a single observation or action as a batch of one."""
+    return map_batch(one, lambda x: np.asarray(x)[None])

@@ -7,7 +7,7 @@ fixed random function, so that members disagree where nothing was seen [Osband e
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
 import numpy as np
@@ -15,11 +15,24 @@ import numpy as np
 from uard import _checks
 from uard.method import uncertainty
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 BOUND = 10.0  # coordinates without finite bounds are cut off here
 
 
 class RewardEnsemble:
-    """Predicts the observed reward of state-actions; members disagree where they have seen little. Changed in place."""
+    """Predicts the observed reward of state-actions; members disagree where they have seen little. Changed in place.
+
+    Examples:
+        >>> place, push = gymnasium.spaces.Box(-1.0, 1.0, (2,)), gymnasium.spaces.Discrete(2)
+        >>> ensemble = RewardEnsemble(place, push)
+        >>> seen, unseen = np.full((64, 2), 0.5), np.full((64, 2), -0.5)
+        >>> ensemble.update(seen, np.ones(64, int), np.ones(64))
+        >>> sigma_m = [ensemble(states, np.ones(64, int)).mean() for states in (seen, unseen)]
+        >>> bool(sigma_m[0] < sigma_m[1])
+        True
+    """
 
     def __init__(
         self,
@@ -42,6 +55,9 @@ class RewardEnsemble:
             ridge: Penalty > 0, in steps: how many it takes before data outweigh the prior.
             prior_scale: Deviation of the fixed random functions, in reward units, > 0.
             seed: Of the features, the priors and the bootstrap.
+
+        Raises:
+            InvalidValueError: naming the argument, its value and what is allowed.
         """
         _checks.whole("members", members, low=2, high=64)
         _checks.whole("features", features, low=1, high=4096)
@@ -55,43 +71,44 @@ class RewardEnsemble:
         self._prior = self._random.normal(0.0, prior_scale, (members, features))
         self._gram = np.tile(ridge * np.eye(features), (members, 1, 1))
         self._moment = np.zeros((members, features))
-        self._weights = np.zeros((members, features))
+        self._weights: np.ndarray = np.zeros((members, features))
         self._seen, self._due = 0, 1
 
-    def __call__(self, observations: Any, actions: Any) -> np.ndarray:
-        """Return sigma_m (B,) of a batch of state-actions, in reward units."""
+    def __call__(self, observations: Any, actions: Any) -> Float[np.ndarray, " B"]:
+        """Return sigma_m of a batch of state-actions of the two spaces, in reward units."""
         return uncertainty.sigma_model(self.predict(observations, actions), axis=0)
 
-    def predict(self, observations: Any, actions: Any) -> np.ndarray:
-        """Return every member's estimate, (N, B)."""
+    def predict(self, observations: Any, actions: Any) -> Float[np.ndarray, "N B"]:
+        """Return every member's estimate of the observed reward."""
         return np.einsum("nbf,nf->nb", self._features(observations, actions), self._prior + self._weights)
 
-    def update(self, observations: Any, actions: Any, rewards: Any) -> None:
-        """Learn from a batch of steps; members are solved anew after 1, 2, 4 ... 256, 512, 768 ... steps."""
+    def update(self, observations: Any, actions: Any, rewards: Float[np.ndarray, " B"]) -> None:
+        """Learn from a batch of steps; members are fitted again after 1, 2, 4 ... 256, 512, 768 ... steps."""
         z = self._features(observations, actions)
-        often = self._random.poisson(1.0, z.shape[:2]).astype(float)
-        left = rewards - np.einsum("nbf,nf->nb", z, self._prior)
-        heavy = often[..., None] * z
-        self._gram += np.einsum("nbf,nbg->nfg", heavy, z)
-        self._moment += np.einsum("nbf,nb->nf", heavy, left)
+        times = self._random.poisson(1.0, z.shape[:2]).astype(float)  # of each step in each member's bootstrap
+        residual = rewards - np.einsum("nbf,nf->nb", z, self._prior)
+        weighted = times[..., None] * z
+        self._gram += np.einsum("nbf,nbg->nfg", weighted, z)
+        self._moment += np.einsum("nbf,nb->nf", weighted, residual)
         self._seen += len(rewards)
         if self._seen >= self._due:
             self._due = self._seen + min(self._seen, 256)
             self._weights = np.linalg.solve(self._gram, self._moment[..., None])[..., 0]
 
-    def _features(self, observations: Any, actions: Any) -> np.ndarray:
+    def _features(self, observations: Any, actions: Any) -> Float[np.ndarray, "N B F"]:
         flat = np.concatenate([_flat(s, x) for s, x in zip(self._spaces, (observations, actions), strict=True)], axis=1)
         projected = np.einsum("bw,nwf->nbf", flat, self._directions) * np.sqrt(flat.shape[1])
         return np.cos(projected + self._phases) * np.sqrt(2.0 / self._phases.shape[-1])
 
 
-def _flat(space: gymnasium.Space[Any], batch: Any) -> np.ndarray:
-    """Return a batch as (B, width) numbers of size about one."""
+def _flat(space: gymnasium.Space[Any], batch: Any) -> Float[np.ndarray, "B width"]:
+    """Return a batch as numbers of size about one."""
     if isinstance(space, gymnasium.spaces.Discrete):
         return np.eye(int(space.n))[np.asarray(batch).reshape(-1) - int(space.start)]
     if isinstance(space, gymnasium.spaces.Box):
         flat = np.asarray(batch, float).reshape(len(batch), -1)
-        low, high = space.low.ravel().astype(float), space.high.ravel().astype(float)
+        box = cast("Any", space)  # the precision of its bounds is not in its type
+        low, high = (np.asarray(bound, float).ravel() for bound in (box.low, box.high))
         bounded = np.isfinite(low) & np.isfinite(high)
         middle, half = np.where(bounded, (low + high) / 2, 0.0), np.where(bounded, (high - low) / 2, 1.0)
         return np.clip((flat - middle) / np.where(half > 0, half, 1.0), -BOUND, BOUND)
@@ -100,6 +117,8 @@ def _flat(space: gymnasium.Space[Any], batch: Any) -> np.ndarray:
 
 
 def _length(batch: Any) -> int:
+    """Return B of a batch that may be a dictionary or a tuple of batches."""
     while isinstance(batch, dict | tuple):
-        batch = next(iter(batch.values())) if isinstance(batch, dict) else batch[0]
+        parts = cast("dict[Any, Any] | tuple[Any, ...]", batch)
+        batch = next(iter(parts.values())) if isinstance(parts, dict) else parts[0]
     return len(batch)

@@ -10,7 +10,7 @@ known now, and by the critics as they are now::
 
     DQN("MlpPolicy", env, replay_buffer_class=ReliabilityReplayBuffer).learn(100_000, callback=ReliabilityCallback())
 
-RatingsFn come from ``info["ratings"]`` or from a callable. ``rollout/ep_rew_mean`` is what the Monitor saw: the raw
+Ratings come from ``info["ratings"]`` or from a callable. ``rollout/ep_rew_mean`` is what the Monitor saw: the raw
 return where it is inside ``ReliabilityVecEnv``, as ``make_vec_env`` has it. The callback logs ``uard/raw_return`` and
 ``uard/filtered_return`` beside each other.
 """
@@ -19,8 +19,9 @@ from __future__ import annotations
 
 import pickle
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
+import gymnasium
 import numpy as np
 
 from uard import _checks
@@ -39,11 +40,23 @@ except ModuleNotFoundError as error:
         f"uard.adapters.sb3 needs Stable-Baselines3: pip install 'uard[sb3]' ({error})", name=error.name
     ) from error
 
-EVERY = 16  # steps of which one is logged
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Integer
+
+EVERY = 16  # the callback logs one step of so many
 
 
 class ReliabilityVecEnv(VecEnvWrapper):
     """Emits filtered rewards; ``infos[i]`` also holds what ``uard.adapters.gymnasium.ReliabilityWrapper`` puts there.
+
+    Examples:
+        >>> import uard.envs
+        >>> from stable_baselines3.common.env_util import make_vec_env
+        >>> env = ReliabilityVecEnv(make_vec_env("uard/TrapGrid6-v0", n_envs=2, env_kwargs={"panel": "main"}))
+        >>> observations = env.reset()
+        >>> observations, rewards, dones, infos = env.step(np.array([3, 1]))
+        >>> rewards.shape, "weight" in infos[0]
+        ((2,), True)
 
     Attributes:
         steps: What filters; one for all environments.
@@ -66,8 +79,9 @@ class ReliabilityVecEnv(VecEnvWrapper):
             InvalidValueError: if rewards arrive normalised: ``VecNormalize`` goes outside.
         """
         _refuse_normalised(venv)
-        super().__init__(venv)
-        key = key or natural_key(venv.observation_space, venv.action_space)
+        cast("Any", super()).__init__(venv)  # its signature holds types of unknown parameters
+        spaces: Any = venv
+        key = key or natural_key(spaces.observation_space, spaces.action_space)
         self.steps = Steps(RewardStream(mitigation, abstention=abstention), ratings, sigma_m, key)
         self.latest: Filtered | None = None
         self._observation: Any = None
@@ -75,7 +89,7 @@ class ReliabilityVecEnv(VecEnvWrapper):
         self._returns = np.zeros((2, venv.num_envs))
 
     def reset(self) -> Any:
-        """Start all episodes; what was learned of the raters is kept."""
+        """Start all episodes; all ratings are remembered."""
         self._observation = self.venv.reset()
         self._returns[:] = 0.0
         return self._observation
@@ -91,9 +105,10 @@ class ReliabilityVecEnv(VecEnvWrapper):
         Raises:
             InvalidValueError: for a reward or ratings that no training should be fed; names the environment.
         """
-        next_observation, rewards, dones, infos = self.venv.step_wait()
+        venv: Any = self.venv
+        next_observation, rewards, dones, infos = venv.step_wait()
         reached = next_observation if self.steps.ratings is None else _reached(next_observation, dones, infos)
-        found = rows_of({i: x["ratings"] for i, x in enumerate(infos) if x.get("ratings") is not None}, len(infos))
+        found = _ratings_in(infos)
         out = self.steps.filter(self._observation, self._actions, reached, np.asarray(rewards, float), found)
         self.latest = out
         self._returns[0] += out.raw
@@ -109,13 +124,22 @@ class ReliabilityVecEnv(VecEnvWrapper):
         return next_observation, out.reward.astype(np.float32), dones, infos
 
     def save(self, path: str | Path) -> None:
-        """Write what was learned of rewards and raters to a file."""
+        """Write all that is known of rewards and ratings to a file, for ``load``."""
         with Path(path).open("wb") as file:
             pickle.dump(self.steps.stream, file)
 
     @classmethod
     def load(cls, path: str | Path, venv: VecEnv, **sources: Any) -> ReliabilityVecEnv:
-        """Wrap environments with what ``save`` wrote; ``sources`` are ``ratings``, ``sigma_m`` and ``key``."""
+        """Wrap environments with what ``save`` wrote.
+
+        Args:
+            path: The file.
+            venv: The environments.
+            sources: ``ratings``, ``sigma_m`` and ``key``, as for a new wrapper.
+
+        Raises:
+            InvalidValueError: the file holds something else.
+        """
         with Path(path).open("rb") as file:
             stream = pickle.load(file)
         if not isinstance(stream, RewardStream):
@@ -125,34 +149,47 @@ class ReliabilityVecEnv(VecEnvWrapper):
         return env
 
 
+def _ratings_in(infos: list[dict[str, Any]]) -> Float[np.ndarray, "B K"] | None:
+    return rows_of({i: x["ratings"] for i, x in enumerate(infos) if x.get("ratings") is not None}, len(infos))
+
+
 def _refuse_normalised(venv: Any) -> None:
     while isinstance(venv, VecEnvWrapper):
         if isinstance(venv, VecNormalize) and venv.norm_reward:
-            allowed = "VecNormalize(ReliabilityVecEnv(venv)): raters do not speak in normalised rewards"
+            allowed = "VecNormalize(ReliabilityVecEnv(venv)): ratings are not in normalised units"
             raise _checks.InvalidValueError("venv", type(venv).__name__, allowed)
         venv = venv.venv
 
 
-def _reached(next_observation: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> Any:
-    """Return what the steps led to, before any reset."""
-    if not dones.any():
+def _reached(next_observation: Any, dones: Bool[np.ndarray, " B"], infos: list[dict[str, Any]]) -> Any:
+    """Return what the steps led to, before any reset; of a dictionary of arrays, every array."""
+    ended = {int(i): infos[i]["terminal_observation"] for i in np.flatnonzero(dones)}
+    if not ended:
         return next_observation
     if isinstance(next_observation, dict):
-        part = [
-            {"terminal_observation": i["terminal_observation"]} if "terminal_observation" in i else {} for i in infos
-        ]
-        return {
-            name: _reached(x, dones, [{k: v[name] for k, v in i.items()} for i in part])
-            for name, x in next_observation.items()
-        }
-    reached = np.array(next_observation)
-    for i in np.flatnonzero(dones):
-        reached[i] = infos[i]["terminal_observation"]
-    return reached
+        parts = cast("dict[str, Any]", next_observation)
+        return {name: _put(x, {i: last[name] for i, last in ended.items()}) for name, x in parts.items()}
+    return _put(next_observation, ended)
+
+
+def _put(batch: np.ndarray, rows: dict[int, Any]) -> np.ndarray:
+    """Return a copy of an array with some rows replaced."""
+    out = np.array(batch)
+    for i, row in rows.items():
+        out[i] = row
+    return out
 
 
 class ReliabilityReplayBuffer(ReplayBuffer):
     """Keeps raw rewards and their ratings, and filters whenever it is sampled.
+
+    Examples:
+        >>> from gymnasium.spaces import Discrete
+        >>> buffer = ReliabilityReplayBuffer(8, Discrete(9), Discrete(4))
+        >>> state, action, reward, done = (np.array([x]) for x in (7, 2, 4.0, False))
+        >>> buffer.add(state, state, action, reward, done, [{"ratings": [-1.0, 2.0, 1.0]}])
+        >>> buffer.sample(5).rewards.shape, buffer.latest.raw.tolist()
+        (torch.Size([5, 1]), [4.0, 4.0, 4.0, 4.0, 4.0])
 
     For ``replay_buffer_class=`` of DQN, SAC, TD3 and DDPG with one-step targets and observations that are arrays; the
     options go into ``replay_buffer_kwargs``. ``save_replay_buffer`` keeps all of it.
@@ -172,8 +209,9 @@ class ReliabilityReplayBuffer(ReplayBuffer):
         **options: Any,
     ):
         """Build an empty buffer; see ``ReplayBuffer`` and ``uard.adapters.gymnasium.ReliabilityWrapper``."""
-        super().__init__(*arguments, **options)
-        key = key or natural_key(self.observation_space, self.action_space)
+        cast("Any", super()).__init__(*arguments, **options)
+        spaces: Any = self
+        key = key or natural_key(spaces.observation_space, spaces.action_space)
         self.steps = Steps(RewardStream(mitigation), ratings, sigma_m, key)
         self.latest: Filtered | None = None
         size = self.buffer_size, self.n_envs
@@ -190,11 +228,12 @@ class ReliabilityReplayBuffer(ReplayBuffer):
         """
         place = self.pos
         rewards = np.asarray(reward, float).reshape(-1)
-        found = rows_of({i: x["ratings"] for i, x in enumerate(infos) if x.get("ratings") is not None}, self.n_envs)
+        found = _ratings_in(infos)
         obs, action = np.asarray(obs), np.asarray(action)
         states, acts = obs.reshape(self.n_envs, *self.obs_shape), action.reshape(self.n_envs, self.action_dim)
-        if self.steps.key is not None:
-            states, acts = _numbered(states), _numbered(acts)
+        if self.steps.key is not None:  # which is given numbers, where states or actions are numbers
+            spaces = cast("Any", self)
+            states, acts = _numbers_in(spaces.observation_space, states), _numbers_in(spaces.action_space, acts)
         ratings = self.steps.ratings_of(states, acts, next_obs, rewards, found)
         slots = self.steps.stream.observe(rewards, ratings, self.steps.keys(states, acts, self.n_envs)).slots
         super().add(obs, next_obs, action, reward, done, infos)
@@ -204,8 +243,8 @@ class ReliabilityReplayBuffer(ReplayBuffer):
         else:
             self._slots[place] = slots
 
-    def _keep_ratings(self, place: int, ratings: Any) -> None:
-        """Write the ratings (E, K) of one step of all environments down; None is no rating."""
+    def _keep_ratings(self, place: int, ratings: Float[np.ndarray, "E K"] | None) -> None:
+        """Keep the ratings of one step of all E environments; None is no rating."""
         self._ratings[place] = np.nan
         if ratings is not None:
             more = ratings.shape[1] - self._ratings.shape[2]
@@ -213,7 +252,7 @@ class ReliabilityReplayBuffer(ReplayBuffer):
                 self._ratings = np.pad(self._ratings, ((0, 0), (0, 0), (0, more)), constant_values=np.nan)
             self._ratings[place, :, : ratings.shape[1]] = ratings
 
-    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Any:
+    def _get_samples(self, batch_inds: Integer[np.ndarray, " batch"], env: VecNormalize | None = None) -> Any:
         raw = self._raw[batch_inds].reshape(-1)
         keyed, stream = self.steps.key is not None, self.steps.stream
         if keyed:
@@ -229,29 +268,39 @@ class ReliabilityReplayBuffer(ReplayBuffer):
         return super()._get_samples(batch_inds, env)
 
 
-def _numbered(column: np.ndarray) -> np.ndarray:
-    return column.reshape(len(column), -1)[:, 0] if column.ndim > 1 else column
+def _numbers_in(space: Any, batch: np.ndarray) -> np.ndarray:
+    """Return a batch (B, ...) as (B,) where the space is one of numbers."""
+    return batch.reshape(len(batch)) if isinstance(space, gymnasium.spaces.Discrete) else batch
 
 
 class CriticDisagreement:
     """sigma_m from the critics of an algorithm that has several (SAC, TD3, TQC): deviation of their values.
 
     In units of value, as in the paper (A12).
+
+    Examples:
+        >>> from stable_baselines3 import SAC
+        >>> sigma_m = CriticDisagreement(SAC("MlpPolicy", "Pendulum-v1"))
+        >>> sigma_m(np.zeros((5, 3), np.float32), np.zeros((5, 1))).shape
+        (5,)
     """
 
     def __init__(self, model: Any):
         """Read the critics of a model.
 
+        Args:
+            model: Of Stable-Baselines3 or sb3-contrib.
+
         Raises:
-            InvalidValueError: if it has fewer than two.
+            InvalidValueError: if it has fewer than two critics.
         """
         if critics_of(model) < 2:
             allowed = "one with two critics or more (SAC, TD3; policy_kwargs=dict(n_critics=5))"
             raise _checks.InvalidValueError("model", type(model).__name__, allowed)
         self._model = model
 
-    def __call__(self, observations: Any, actions: Any) -> np.ndarray:
-        """Return sigma_m (B,) of state-actions as the critics take them: states normalised, actions in [-1, 1]."""
+    def __call__(self, observations: Any, actions: Any) -> Float[np.ndarray, " B"]:
+        """Return sigma_m of state-actions as the critics take them: states normalised, actions in [-1, 1]."""
         import torch
 
         with torch.no_grad():
@@ -261,15 +310,21 @@ class CriticDisagreement:
             values = torch.cat(self._model.critic(states, acts), 1)
         return values.std(1, correction=1).double().cpu().numpy()
 
-    def outside(self, observations: Any, actions: Any) -> np.ndarray:
-        """Return sigma_m (B,) of state-actions as the environments have them."""
+    def outside(self, observations: Any, actions: Any) -> Float[np.ndarray, " B"]:
+        """Return sigma_m of state-actions as the environments have them."""
         normalised = self._model.get_vec_normalize_env()
         states = observations if normalised is None else normalised.normalize_obs(observations)
         return self(states, self._model.policy.scale_action(actions))
 
 
 def critics_of(model: Any) -> int:
-    """Return how many critics a model of Stable-Baselines3 has that rate a state with an action."""
+    """Return how many critics a model of Stable-Baselines3 has that give a state with an action a value.
+
+    Examples:
+        >>> from stable_baselines3 import SAC
+        >>> critics_of(SAC("MlpPolicy", "Pendulum-v1"))
+        2
+    """
     return len(getattr(getattr(model, "critic", None), "q_networks", ()))
 
 
@@ -279,10 +334,21 @@ class ReliabilityCallback(BaseCallback):
     Scalars, means of every sixteenth step since the last dump: ``weight``, ``sigma_m``, ``sigma_h``, ``lambda_t``,
     ``abstained``, ``reward`` and ``raw_reward``; with ``ReliabilityVecEnv`` also ``raw_return`` and
     ``filtered_return``, of every episode.
+
+    Examples:
+        >>> import uard.envs
+        >>> from stable_baselines3 import DQN
+        >>> model = DQN("MlpPolicy", "uard/TrapGrid6-v0", replay_buffer_class=ReliabilityReplayBuffer)
+        >>> model = model.learn(32, callback=ReliabilityCallback())
     """
 
     def __init__(self, critics: bool = True, verbose: int = 0):
-        """Choose whether sigma_m comes from the critics where nothing else was given."""
+        """Start.
+
+        Args:
+            critics: Whether sigma_m is the critics' disagreement where nothing else was given.
+            verbose: See ``BaseCallback``.
+        """
         super().__init__(verbose)
         self._critics = critics
         self._lent: list[Steps] = []

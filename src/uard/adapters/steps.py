@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
 import numpy as np
 
 from uard import _checks
 from uard.ratings.stream import Filtered, RewardStream
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 RatingsFn = Callable[[Any, Any, Any, np.ndarray], Any]
 """(observations, actions, next observations, observed rewards), all (B, ...) -> ratings (B, K), NaN where missing."""
@@ -35,6 +38,14 @@ INFO = {
 class Steps:
     """Filters batches of steps.
 
+    Observations may be arrays (B, ...) or dictionaries and tuples of such.
+
+    Examples:
+        >>> steps = Steps(ratings=lambda observations, actions, next_observations, rewards: rewards[:, None])
+        >>> now, act, then = np.zeros((2, 4)), np.array([0, 1]), np.ones((2, 4))
+        >>> steps.filter(now, act, then, np.array([0.0, 1.0]), None).rated.tolist()
+        [True, True]
+
     Attributes:
         stream: What is known so far.
         ratings: Gives ratings; where None, those that the environment put into ``info`` are taken.
@@ -48,13 +59,24 @@ class Steps:
     key: KeyFn | None = None
 
     def keys(self, observations: Any, actions: Any, count: int) -> list[Hashable] | None:
-        """Return the keys of a batch, or None where all steps differ."""
-        return None if self.key is None else [self.key(_row(observations, i), actions[i]) for i in range(count)]
+        """Return the keys of a batch of ``count`` steps, or None where all steps differ."""
+        if self.key is None:
+            return None
+        return [self.key(_row(observations, i), actions[i]) for i in range(count)]
 
     def ratings_of(
-        self, observations: Any, actions: Any, next_observations: Any, rewards: np.ndarray, info: Any
-    ) -> Any:
-        """Return the ratings of a batch, from the callable or as found in ``info``."""
+        self,
+        observations: Any,
+        actions: Any,
+        next_observations: Any,
+        rewards: Float[np.ndarray, " B"],
+        info: Float[np.ndarray, "B K"] | None,
+    ) -> Float[np.ndarray, "B K"] | None:
+        """Return the ratings of a batch, from the callable or as found in ``info``; NaN where one is missing.
+
+        Raises:
+            InvalidValueError: what the callable gave is no (B, K) array of numbers.
+        """
         if self.ratings is None:
             return info
         ratings = _checks.as_numpy("ratings(...)", self.ratings(observations, actions, next_observations, rewards))
@@ -64,9 +86,25 @@ class Steps:
         return ratings
 
     def filter(
-        self, observations: Any, actions: Any, next_observations: Any, rewards: np.ndarray, info: Any
+        self,
+        observations: Any,
+        actions: Any,
+        next_observations: Any,
+        rewards: Float[np.ndarray, " B"],
+        info: Float[np.ndarray, "B K"] | None,
     ) -> Filtered:
-        """Filter a batch of steps; ``info`` holds the ratings (B, K) that came with it, or is None."""
+        """Filter a batch of steps.
+
+        Args:
+            observations: What the actions were taken on.
+            actions: (B, ...).
+            next_observations: What they led to, before any reset.
+            rewards: Observed rewards.
+            info: The ratings that came with the steps, NaN where one is missing, or None.
+
+        Raises:
+            InvalidValueError: for rewards, ratings or a sigma_m that no training should be fed.
+        """
         ratings = self.ratings_of(observations, actions, next_observations, rewards, info)
         sigma_m = None if self.sigma_m is None else self.sigma_m(observations, actions)
         out = self.stream(rewards, ratings, sigma_m, self.keys(observations, actions, len(rewards)))
@@ -77,7 +115,13 @@ class Steps:
 
 
 def natural_key(observation_space: gymnasium.Space[Any], action_space: gymnasium.Space[Any]) -> KeyFn | None:
-    """Return the key of a world of numbered states and actions; None for all others."""
+    """Return the key of a world of numbered states and actions; None for all others.
+
+    Examples:
+        >>> key = natural_key(gymnasium.spaces.Discrete(9), gymnasium.spaces.Discrete(4))
+        >>> key(np.int64(7), np.int64(2))
+        (7, 2)
+    """
     discrete = gymnasium.spaces.Discrete
     return _numbers if isinstance(observation_space, discrete) and isinstance(action_space, discrete) else None
 
@@ -86,13 +130,24 @@ def _numbers(observation: Any, action: Any) -> Hashable:
     return int(observation), int(action)
 
 
-def rows_of(entries: Mapping[int, Any], count: int) -> np.ndarray | None:
-    """Return the ratings of some of ``count`` steps as (count, K); NaN for steps and raters that are missing.
+def rows_of(entries: Mapping[int, Any], count: int) -> Float[np.ndarray, "B K"] | None:
+    """Return the ratings of some of ``count`` steps as an array; NaN for steps and raters that are missing.
+
+    Examples:
+        >>> rows_of({1: [0.5, None]}, count=2).tolist()
+        [[nan, nan], [0.5, nan]]
+
+    Args:
+        entries: The ratings of a step, by its number.
+        count: B.
+
+    Returns:
+        None if there are none at all.
 
     Raises:
         InvalidValueError: naming the environment whose ratings are no row of numbers.
     """
-    rows = {}
+    rows: dict[int, np.ndarray] = {}
     for i, entry in entries.items():
         try:
             row = np.array([np.nan if x is None else x for x in entry], float)
@@ -109,14 +164,38 @@ def rows_of(entries: Mapping[int, Any], count: int) -> np.ndarray | None:
     return out
 
 
-def subset(batch: Any, chosen: np.ndarray) -> Any:
-    """Return some rows of a batch of observations."""
+def map_batch(batch: Any, function: Callable[[Any], Any]) -> Any:
+    """Return a batch of observations with a function applied to each of its arrays.
+
+    Examples:
+        >>> map_batch({"place": np.array([1, 2]), "speed": np.array([3, 4])}, lambda x: x[1:].tolist())
+        {'place': [2], 'speed': [4]}
+
+    Args:
+        batch: An array, or a dictionary or tuple of batches.
+        function: Given each array.
+    """
     if isinstance(batch, dict):
-        return {name: subset(part, chosen) for name, part in batch.items()}
-    return tuple(subset(part, chosen) for part in batch) if isinstance(batch, tuple) else np.asarray(batch)[chosen]
+        parts = cast("dict[str, Any]", batch)
+        return {name: map_batch(part, function) for name, part in parts.items()}
+    if isinstance(batch, tuple):
+        return tuple(map_batch(part, function) for part in cast("tuple[Any, ...]", batch))
+    return function(batch)
 
 
 def _row(batch: Any, i: int) -> Any:
-    if isinstance(batch, dict):
-        return {name: _row(part, i) for name, part in batch.items()}
-    return tuple(_row(part, i) for part in batch) if isinstance(batch, tuple) else batch[i]
+    return map_batch(batch, lambda x: x[i])
+
+
+def subset(batch: Any, chosen: np.ndarray) -> Any:
+    """Return some rows of a batch of observations.
+
+    Examples:
+        >>> subset({"place": np.array([1, 2])}, np.array([1]))["place"].tolist()
+        [2]
+
+    Args:
+        batch: As for ``map_batch``.
+        chosen: Numbers of the rows, or one number in an array of no dimensions.
+    """
+    return map_batch(batch, lambda x: np.asarray(x)[chosen])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -14,23 +15,34 @@ from uard.method.weights import discount
 from uard.ratings.aggregate import aggregate, by_item
 from uard.ratings.log import RatingLog
 
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Integer, Shaped
+
 PRINTED = "uard-operator"
-PAIRS = 200_000  # of rows that are compared
-LARGEST = 1e100  # what is larger is no reward, and its square no number
+PAIRS = 200_000  # most pairs of rows that are compared
+LARGEST = 1e100  # no reward is as large, and the squares of larger numbers overflow
 ROUNDING = 1e-6  # of a unit: logs are often written in single precision
-FEW = 30  # rated rows below which no statistic means much
+FEW = 30  # with fewer rated rows no statistic means much
 
 
 class FilterOutcome(NamedTuple):
-    """What a filter makes of each row."""
+    """What a filter makes of each row.
+
+    Attributes:
+        name: What messages call the filter.
+        method: The filter.
+        weight: How far each reward is believed, in [0, 1].
+        learned: The reward that would be learned from, in reward units.
+    """
 
     name: str
     method: Mitigation
-    weight: np.ndarray
-    believed: np.ndarray
+    weight: Float[np.ndarray, " n"]
+    learned: Float[np.ndarray, " n"]
 
 
-class Case(NamedTuple):
+@dataclass(frozen=True)
+class Case:
     """A log of which only usable numbers are left, and what the filters make of it.
 
     Attributes:
@@ -42,56 +54,61 @@ class Case(NamedTuple):
         true: What they were really worth, NaN where unknown, or None.
         feedback: What is known of each row's item.
         distinct: What is known of every distinct item.
-        rated: Whether that is anything.
-        together: Whether two or more raters were ever asked of one row of it at the same time.
-        unit: Standard deviation of the rewards.
-        noise: How far the mean of a row's ratings may be from what raters mean: so many of its usual standard errors
-            that of all rows hardly one gets there by chance.
-        mine: The filter that is going to be used.
+        rated: Whether anybody has rated the row's item.
+        together: Whether at least two raters have rated one row of the item, so that they can be compared.
+        unit: Standard deviation of the rewards; 1 if all are equal.
+        noise: How far the mean of a row's ratings may be from what raters mean: so many of its median standard errors
+            that among all rows hardly one gets there by chance.
+        chosen: The filter that is going to be used.
         printed: The filter as printed.
-        advised: The filter that we recommend.
+        recommended: The filter that we recommend.
     """
 
     log: RatingLog
-    rows: np.ndarray
-    reward: np.ndarray
-    ratings: np.ndarray
-    sigma_m: np.ndarray | None
-    true: np.ndarray | None
+    rows: Integer[np.ndarray, " n"]
+    reward: Float[np.ndarray, " n"]
+    ratings: Float[np.ndarray, "n K"]
+    sigma_m: Float[np.ndarray, " n"] | None
+    true: Float[np.ndarray, " n"] | None
     feedback: Feedback
     distinct: Feedback
-    rated: np.ndarray
-    together: np.ndarray
+    rated: Bool[np.ndarray, " n"]
+    together: Bool[np.ndarray, " n"]
     unit: float
     noise: float
-    mine: FilterOutcome
+    chosen: FilterOutcome
     printed: FilterOutcome
-    advised: FilterOutcome
+    recommended: FilterOutcome
 
     def place(self, row: int) -> str:
         """Return where a row is, in words."""
         return self.log.place(int(self.rows[row]))
 
-    def gap(self) -> np.ndarray:
+    def gap(self) -> Float[np.ndarray, " n"]:
         """Return the reward minus the mean rating; 0 where nobody rated."""
         return np.where(self.rated, self.reward - self.feedback.mean, 0.0)
 
-    def far(self) -> np.ndarray:
-        """Return where the mean rating is more than a unit from the reward, and that is no noise."""
+    def far(self) -> Bool[np.ndarray, " n"]:
+        """Return where the mean rating is more than a unit from the reward, and not by noise alone."""
         return np.abs(self.gap()) > max(self.unit, self.noise)
 
-    def agreed(self, distance: np.ndarray) -> np.ndarray:
+    def agreed(self, distance: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Return where raters are nearer to each other than to what is at that distance from their mean."""
         return self.together & (3.0 * self.feedback.sd < np.abs(distance))
 
 
-def usable(x: np.ndarray) -> np.ndarray:
-    """Return which numbers can be a reward or a rating (bool)."""
+def usable(x: Float[np.ndarray, "*any"]) -> Bool[np.ndarray, "*any"]:
+    """Return which numbers can be a reward or a rating."""
     return np.abs(x) < LARGEST
 
 
 def case_of(log: RatingLog, name: str, method: Mitigation) -> Case:
-    """Leave out what no number can be taken from, and put the rest through the filters.
+    """Leave out the rows and cells that hold no usable number, and put the rest through the filters.
+
+    Args:
+        log: The log.
+        name: What to call the filter that is going to be used.
+        method: That filter.
 
     Raises:
         InvalidValueError: no reward is a number.
@@ -107,29 +124,36 @@ def case_of(log: RatingLog, name: str, method: Mitigation) -> Case:
     together = np.isfinite(ratings).sum(1) >= 2
     if item is not None:
         together = (np.bincount(item, together) > 0)[item]
-    error = known.sd[together] / np.sqrt(np.maximum(known.raters[together] - 1.0, 1.0))
-    deviation = float(reward.std())
 
     def outcome(name: str, method: Mitigation) -> FilterOutcome:
         return FilterOutcome(name, method, *filtered_rows(method, reward, sigma_m, known, distinct))
 
+    deviation = float(reward.std())
     return Case(
-        log,
-        rows,
-        reward,
-        ratings,
-        sigma_m,
-        true,
-        known,
-        distinct,
-        known.count > 0,
-        together,
-        deviation if deviation > 1e-12 * np.abs(reward).max() else 1.0,
-        1.5 * math.sqrt(2.0 * math.log(error.size)) * float(np.median(error)) if error.size else 0.0,
-        outcome(name, method),
-        outcome(PRINTED, as_filter(PRINTED)),
-        outcome("uard", as_filter("uard")),
+        log=log,
+        rows=rows,
+        reward=reward,
+        ratings=ratings,
+        sigma_m=sigma_m,
+        true=true,
+        feedback=known,
+        distinct=distinct,
+        rated=known.count > 0,
+        together=together,
+        unit=deviation if deviation > 1e-12 * np.abs(reward).max() else 1.0,
+        noise=_noise(known.sd[together], known.raters[together]),
+        chosen=outcome(name, method),
+        printed=outcome(PRINTED, as_filter(PRINTED)),
+        recommended=outcome("uard", as_filter("uard")),
     )
+
+
+def _noise(sd: Float[np.ndarray, " m"], raters: Float[np.ndarray, " m"]) -> float:
+    """Return one and a half times what the largest of m normal errors is about; see ``Case.noise``."""
+    if not sd.size:
+        return 0.0
+    error = sd / np.sqrt(np.maximum(raters - 1.0, 1.0))
+    return 1.5 * math.sqrt(2.0 * math.log(sd.size)) * float(np.median(error))
 
 
 def as_filter(mitigation: str | Mitigation) -> Mitigation:
@@ -138,19 +162,28 @@ def as_filter(mitigation: str | Mitigation) -> Mitigation:
     Raises:
         InvalidValueError: it is no form of the filter.
     """
+    allowed = "a form of the filter (uard, uard-operator, ...)"
     method = named(mitigation) if isinstance(mitigation, str) else mitigation
-    if not isinstance(method, Mitigation) or not method.discounts:
-        raise _checks.InvalidValueError("mitigation", mitigation, "a form of the filter (uard, uard-operator, ...)")
+    if not _checks.instance("mitigation", method, Mitigation, allowed).discounts:
+        raise _checks.InvalidValueError("mitigation", mitigation, allowed)
     return method
 
 
-def numbered(item: np.ndarray | None) -> np.ndarray | None:
+def numbered(item: Shaped[np.ndarray, " n"] | None) -> Integer[np.ndarray, " n"] | None:
     """Return the items as numbers 0..M-1."""
     return None if item is None else np.unique(item, return_inverse=True)[1]
 
 
-def feedback_of(reward: np.ndarray, ratings: np.ndarray, item: np.ndarray | None) -> tuple[Feedback, Feedback]:
-    """Return what is known of every row's item, and of every distinct item."""
+def feedback_of(
+    reward: Float[np.ndarray, " n"], ratings: Float[np.ndarray, "n K"], item: Integer[np.ndarray, " n"] | None
+) -> tuple[Feedback, Feedback]:
+    """Return what is known of every row's item, and of every distinct item.
+
+    Args:
+        reward: Of every row.
+        ratings: Of every row, NaN where one is missing; K may be 0.
+        item: The number of every row's item; None if no two rows have the same.
+    """
     here = np.isfinite(ratings)
     if ratings.shape[1] == 0:
         ratings, here = np.zeros((len(reward), 1)), np.zeros((len(reward), 1), bool)
@@ -162,16 +195,28 @@ def feedback_of(reward: np.ndarray, ratings: np.ndarray, item: np.ndarray | None
 
 
 def filtered_rows(
-    method: Mitigation, reward: np.ndarray, sigma_m: np.ndarray | None, known: Feedback, distinct: Feedback
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return every row's weight and the reward that would be learned from."""
+    method: Mitigation,
+    reward: Float[np.ndarray, " n"],
+    sigma_m: Float[np.ndarray, " n"] | None,
+    known: Feedback,
+    distinct: Feedback,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return every row's weight and the reward that would be learned from.
+
+    Args:
+        method: A filter.
+        reward: Of every row.
+        sigma_m: The ensemble's disagreement, 0 if None.
+        known: Of every row's item.
+        distinct: Of every distinct item.
+    """
     method = method.without_prior()
     sigma_m = np.zeros_like(reward) if sigma_m is None else sigma_m
     why = method.explain(Evidence(reward, sigma_m, known), method.fit(distinct, distinct.count > 0))
     return np.asarray(why.weight), np.asarray(discount(reward, why.weight, why.anchor))
 
 
-def rescaled(case: Case, method: Mitigation, shift: float, factor: float) -> np.ndarray:
+def rescaled(case: Case, method: Mitigation, shift: float, factor: float) -> Float[np.ndarray, " n"]:
     """Return what would be learned from if all rewards and ratings were multiplied, then shifted."""
 
     def of(f: Feedback) -> Feedback:
@@ -182,23 +227,25 @@ def rescaled(case: Case, method: Mitigation, shift: float, factor: float) -> np.
     return filtered_rows(method, factor * case.reward + shift, sigma_m, of(case.feedback), of(case.distinct))[1]
 
 
-def pairs(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all pairs of two lists of rows, or as many drawn at random as can be looked at."""
+def pairs(
+    first: Integer[np.ndarray, " p"], second: Integer[np.ndarray, " q"]
+) -> tuple[Integer[np.ndarray, " pairs"], Integer[np.ndarray, " pairs"]]:
+    """Return all pairs of two lists of rows, or ``PAIRS`` of them drawn at random."""
     if first.size * second.size <= PAIRS:
         return np.repeat(first, second.size), np.tile(second, first.size)
     random = np.random.default_rng(0)
     return random.choice(first, PAIRS), random.choice(second, PAIRS)
 
 
-def share_kept(case: Case, outcome: FilterOutcome, where: np.ndarray) -> float:
-    """Return how much of the difference between reward and mean rating is still believed; 1 is all."""
+def share_kept(case: Case, outcome: FilterOutcome, where: Bool[np.ndarray, " n"]) -> float:
+    """Return which share of the difference between reward and mean rating is still learned, in [0, 1]."""
     if not where.any():
         return 0.0
     mean = case.feedback.mean[where]
-    share = (outcome.believed[where] - mean) / (case.reward[where] - mean)
+    share = (outcome.learned[where] - mean) / (case.reward[where] - mean)
     return float(np.clip(share, 0.0, 1.0).mean())
 
 
-def mostly(part: np.ndarray, whole: np.ndarray) -> bool:
-    """Whether a part is more than half of the whole."""
+def mostly(part: Bool[np.ndarray, " n"], whole: Bool[np.ndarray, " n"]) -> bool:
+    """Return whether more than half of the whole are in the part."""
     return bool(part.sum() > 0.5 * whole.sum())

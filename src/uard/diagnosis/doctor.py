@@ -1,12 +1,7 @@
 """The doctor: which known traps is a log of rewards and ratings in, and what avoids them?
 
-    >>> from uard import doctor
-    >>> log = {"reward": [0, 1, 4] * 20, "rating_ann": [0, 1.1, -1.2] * 20, "rating_bob": [0.1, 1, -1] * 20}
-    >>> [f.code for f in doctor(log, "uard-operator").findings]
-    ['reward-contradicted']
-
 Nothing is trained. The doctor puts the log through the filter that is going to be used (``uard`` if none is named) and
-through the filter as printed, and looks at what comes out. A trap of the printed filter that the chosen one avoids is
+through the filter as printed, and checks what comes out. A trap of the printed filter that the chosen one avoids is
 a ``note``; one that the chosen one is in, or that no filter avoids, is a ``warning`` or a ``danger``.
 
 Differences are measured in units: the standard deviation of the observed rewards. It is taken for granted that what is
@@ -17,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,6 +25,9 @@ from uard.ratings import readers
 from uard.ratings.agreement import krippendorff_alpha
 from uard.ratings.log import RatingLog
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 
 def doctor(
     log: RatingLog | str | Path | Mapping[str, Any],
@@ -40,12 +38,17 @@ def doctor(
 ) -> Diagnosis:
     """Name every known trap that a log of rewards and ratings is in.
 
+    Examples:
+        >>> log = {"reward": [0, 1, 4] * 20, "rating_ann": [0, 1.1, -1.2] * 20, "rating_bob": [0.1, 1, -1] * 20}
+        >>> [f.code for f in doctor(log, "uard-operator").findings]
+        ['reward-contradicted']
+
     Args:
-        log: A ``uard.ratings.log.RatingLog``; the path of a CSV, JSONL or Parquet file; or named columns. See ``uard.ratings.readers`` for
-            the columns.
+        log: A ``uard.ratings.log.RatingLog``; the path of a CSV, JSONL or Parquet file; or named columns. See
+            ``uard.ratings.readers`` for the columns.
         mitigation: The filter that is going to be used: the name of one, or a ``Mitigation``.
         reward: Name of the column of rewards, for a file or columns.
-        ratings: Names of the annotators' columns; all that start with ``rating`` if left out.
+        ratings: Names of the annotators' columns, likewise; all that start with ``rating`` if left out.
 
     Raises:
         InvalidValueError: the log cannot be read (the message names row and column), no reward in it is a number, or
@@ -59,19 +62,24 @@ def doctor(
     case = case_of(log, name, as_filter(mitigation))
     found = [log_checks.not_finite(log), *(check(case) for check in CHECKS)]
     return Diagnosis(
-        log.source,
-        name if isinstance(mitigation, str) else repr(mitigation),
-        len(log),
-        log.raters,
-        float(case.rated.mean()),
-        krippendorff_alpha(case.ratings),
-        log_checks.calibration_of(case),
-        tuple(sorted((f for f in found if f is not None), key=lambda f: SEVERITIES.index(f.severity))),
+        source=log.source,
+        mitigation=name if isinstance(mitigation, str) else repr(mitigation),
+        rows=len(log),
+        raters=log.raters,
+        rated=float(case.rated.mean()),
+        agreement=krippendorff_alpha(case.ratings),
+        calibration=log_checks.calibration_of(case),
+        findings=tuple(sorted((f for f in found if f is not None), key=lambda f: SEVERITIES.index(f.severity))),
     )
 
 
-def filtered(log: RatingLog, mitigation: str | Mitigation = "uard") -> np.ndarray:
-    """Return the reward to learn from of every row of a log, (n,): what the doctor looks at.
+def filtered(log: RatingLog, mitigation: str | Mitigation = "uard") -> Float[np.ndarray, " n"]:
+    """Return the reward to learn from of every row of a log, which the doctor checks.
+
+    Examples:
+        >>> log = RatingLog(np.array([1.0, 4.0]), np.array([[1.0, 1.0], [-1.0, 2.0]]))
+        >>> filtered(log, "uard-operator").round(2).tolist()
+        [1.0, 1.6]
 
     Args:
         log: A log whose rewards and ratings are finite; missing ratings are NaN.

@@ -13,10 +13,15 @@ SEVERITIES: tuple[Severity, ...] = ("danger", "warning", "note")
 
 @dataclass(frozen=True)
 class Finding:
-    """A trap that applies.
+    """A trap that a log is in.
+
+    Examples:
+        >>> found = Finding("one-rater", "warning", "One rater.", "Blind trust.", "Have a second person rate.", {"rows": 9.0})
+        >>> found.severity, found.numbers["rows"]
+        ('warning', 9.0)
 
     Attributes:
-        code: Its name; see ``CODES``.
+        code: Its name, one of ``uard.diagnosis.CODES``.
         severity: ``danger``: training goes wrong; ``warning``: it may; ``note``: it would with another setting.
         evidence: What in the log shows it, in numbers.
         consequence: What it would do to training.
@@ -29,12 +34,20 @@ class Finding:
     evidence: str
     consequence: str
     remedy: str
-    numbers: Mapping[str, float] = field(default_factory=dict)
+    numbers: Mapping[str, float] = field(default_factory=dict[str, float])
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What the doctor found.
+    """What the doctor found; ``str(diagnosis)`` is all of it in words.
+
+    Examples:
+        >>> from uard import doctor
+        >>> diagnosis = doctor({"reward": [0, 1, 4] * 20, "rating_ann": [0, 1, -1] * 20, "rating_bob": [0, 1, -1] * 20})
+        >>> diagnosis.count("danger"), [f.code for f in diagnosis.findings]
+        (0, ['idle-raters', 'reward-contradicted'])
+        >>> print(str(diagnosis).splitlines()[0])
+        log: 60 rows, 2 raters (rating_ann, rating_bob), 100 % of rows rated
 
     Attributes:
         source: Which log.
@@ -59,7 +72,7 @@ class Diagnosis:
     findings: tuple[Finding, ...]
 
     def count(self, severity: Severity) -> int:
-        """Return how many findings are of this severity."""
+        """Return how many findings are of this severity: ``danger``, ``warning`` or ``note``."""
         return sum(f.severity == severity for f in self.findings)
 
     def as_data(self) -> dict[str, Any]:
@@ -90,11 +103,11 @@ class Diagnosis:
 
 
 def percent(share: float) -> str:
-    """Return a share in [0, 1] as text."""
+    """Return a share in [0, 1] as text: ``12.5 %``."""
     text = f"{100 * share:.1f}"
     return f"{100 * share:.2g} %" if text == "0.0" and share > 0 else f"{text.removesuffix('.0')} %"
 
 
-def rows(n: int) -> str:
-    """Return a number of rows as text."""
+def row_count(n: int) -> str:
+    """Return a number of rows as text: ``1 row``, ``2 rows``."""
     return f"{n} row" + "s" * (n != 1)

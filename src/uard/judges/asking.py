@@ -1,4 +1,8 @@
-"""Judges: how they are named and asked, and how their scores come to one scale."""
+"""How judges are named and asked: reward functions as TRL calls them, synchronous or ``async``.
+
+A judge is called with the keywords ``prompts``, ``completions`` and whatever else the question holds, and returns one
+number per completion, or None where it has no score.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +12,19 @@ import inspect
 import math
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from uard import _checks
 
-Judge = Callable[..., Any]
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
-EQUAL = 1e-9  # relative deviation at which numbers count as equal
+Judge = Callable[..., Any]
 RESERVED = {"raw", "weight", "sigma_h", "sigma_m"}  # names of other columns in the logs
 
 
@@ -28,47 +32,17 @@ class JudgeError(RuntimeError):
     """A judge raised; the message names it, and what it raised is the cause."""
 
 
-@dataclass
-class Scale:
-    """Mean and standard deviation of all numbers so far, or fixed ones.
-
-    Attributes:
-        count: Numbers so far.
-        location: Their mean.
-        square: Sum of their squared distances from it.
-        fixed: The deviation that the user gave; None for the running one.
-    """
-
-    count: int = 0
-    location: float = 0.0
-    square: float = 0.0
-    fixed: float | None = None
-
-    @property
-    def deviation(self) -> float:
-        """Population standard deviation; 0 while all numbers are equal, up to rounding."""
-        if self.fixed is not None:
-            return self.fixed
-        deviation = math.sqrt(self.square / self.count) if self.count else 0.0
-        return deviation if deviation > EQUAL * abs(self.location) else 0.0
-
-    def observe(self, values: np.ndarray) -> None:
-        """Take in some numbers [Chan et al. 1979], unless the scale is fixed."""
-        if self.fixed is not None or values.size == 0:
-            return
-        mean, total = float(values.mean()), self.count + values.size
-        gap = mean - self.location
-        self.square += float(((values - mean) ** 2).sum()) + gap * gap * self.count * values.size / total
-        self.location += gap * values.size / total
-        self.count = total
-
-    def ratings(self, values: np.ndarray) -> np.ndarray:
-        """(x - location) / deviation; NaN while the deviation is 0, when a number tells nothing."""
-        return (values - self.location) / (self.deviation or math.nan)
-
-
 def by_name(judges: Mapping[str, Judge] | Sequence[Judge]) -> dict[str, Judge]:
     """Return the judges by their names: the keys of a mapping, else their ``__name__``.
+
+    Examples:
+        >>> def length(completions, **question):
+        ...     return [len(text) for text in completions]
+        >>> list(by_name([length, max])), list(by_name({"long": length, "also long": length}))
+        (['length', 'max'], ['long', 'also long'])
+
+    Args:
+        judges: At least two.
 
     Raises:
         InvalidValueError: for fewer than two, and for judges that cannot be called or told apart.
@@ -90,41 +64,69 @@ def by_name(judges: Mapping[str, Judge] | Sequence[Judge]) -> dict[str, Judge]:
 
 
 def ask(judges: Mapping[str, Judge], question: dict[str, Any]) -> dict[str, Any]:
-    """Ask every judge, the ``async`` ones at the same time as the others, and return what each gave.
+    """Ask every judge, the ``async`` ones at the same time as the others.
+
+    Examples:
+        >>> def length(completions, **question):
+        ...     return [len(text) for text in completions]
+        >>> async def questions(completions, **question):
+        ...     return [text.count("?") for text in completions]
+        >>> ask({"length": length, "questions": questions}, {"completions": ["why?", "so"]})
+        {'length': [4, 2], 'questions': [1, 0]}
+
+    Args:
+        judges: By name, see ``by_name``.
+        question: The keywords with which each is called; ``completions`` among them.
+
+    Returns:
+        What each judge returned, by name.
 
     Raises:
         JudgeError: if one raises.
     """
-    size, answers = len(question["completions"]), {}
+    size = len(question["completions"])
+    answers: dict[str, Any] = {}
     for name, judge in judges.items():
-        with _blaming(name, size):
-            answer = judge(**question)
+        with _naming(name, size):
+            answer: Any = judge(**question)
         if inspect.iscoroutine(answer):
             answer = asyncio.run_coroutine_threadsafe(answer, _event_loop(os.getpid()))
         answers[name] = answer
     for name, answer in answers.items():
         if isinstance(answer, Future):
-            with _blaming(name, size):
-                answers[name] = answer.result()
+            with _naming(name, size):
+                answers[name] = cast("Future[Any]", answer).result()
     return answers
 
 
-def as_scores(name: str, answer: Any, size: int) -> np.ndarray:
-    """Return a judge's answer as (size,) numbers, NaN where it gave None or NaN.
+def as_scores(name: str, answer: Any, size: int) -> Float[np.ndarray, " B"]:
+    """Return a judge's answer as numbers, NaN where it gave None or NaN.
+
+    Examples:
+        >>> as_scores("length", [4, None], size=2).tolist()
+        [4.0, nan]
+
+    Args:
+        name: The judge's, for messages.
+        answer: What it returned: a list, an array or a tensor.
+        size: B, how many completions it was asked about.
 
     Raises:
         InvalidValueError: for another number of scores, or one that is no finite number; names judge and place.
     """
     try:
-        answer = answer.tolist() if hasattr(answer, "tolist") else list(answer)
+        listed: Any = answer.tolist() if hasattr(answer, "tolist") else list(answer)
     except TypeError:
         allowed = f"a list of {size} numbers (or None), one per completion"
-        raise _checks.InvalidValueError(f"what judge {name!r} gave", answer, allowed) from None
-    if not isinstance(answer, list) or len(answer) != size:
-        got = len(answer) if isinstance(answer, list) else answer
-        raise _checks.InvalidValueError(f"number of scores of judge {name!r}", got, f"{size}, one per completion")
+        raise _checks.InvalidValueError(f"answer of judge {name!r}", answer, allowed) from None
+    field, allowed = f"number of scores of judge {name!r}", f"{size}, one per completion"
+    if not isinstance(listed, list):  # the tolist() of one number
+        raise _checks.InvalidValueError(field, listed, allowed)
+    given = cast("list[Any]", listed)
+    if len(given) != size:
+        raise _checks.InvalidValueError(field, len(given), allowed)
     scores = np.full(size, math.nan)
-    for index, score in enumerate(answer):
+    for index, score in enumerate(given):
         if score is None:
             continue
         plain = score.item() if getattr(score, "shape", None) == () else score
@@ -137,12 +139,12 @@ def as_scores(name: str, answer: Any, size: int) -> np.ndarray:
 
 def _name(judge: Any) -> str:
     while isinstance(judge, functools.partial):
-        judge = judge.func
+        judge = cast("functools.partial[Any]", judge).func
     return getattr(judge, "__name__", type(judge).__name__)
 
 
 @contextmanager
-def _blaming(name: str, size: int) -> Iterator[None]:
+def _naming(name: str, size: int) -> Generator[None]:
     try:
         yield
     except Exception as error:

@@ -4,19 +4,28 @@
 episode. With w = 1 it is the standard operator (A22); with the anchor b = 0 it is the paper's. Everything is a pure
 NumPy function of (S, A) tables of a deterministic task. Rewards, values, anchors and sigmas share the reward's unit;
 weights are dimensionless; gamma lies in [0, 1).
+
+The examples are of one task: from state 0 action 0 leads to state 1 for nothing, action 1 ends the episode for a reward
+of 1; from state 1 both actions end it for 2.
+
+    >>> next_state = np.array([[1, 0], [1, 1]])
+    >>> reward = np.array([[0.0, 1.0], [2.0, 2.0]])
+    >>> terminal = np.array([[False, True], [True, True]])
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from uard import _checks
 from uard.method.weights import Form, ReliabilityFilter, discount
 
-Weight = float | np.ndarray
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Integer, Real
+
 _TIE = 1e-9  # values closer than this count as equal, and then the first action is taken
 
 
@@ -25,27 +34,27 @@ class TabularTask(Protocol):
 
     @property
     def next_state(self) -> Any:
-        """(S, A) states that are entered, integers in 0..S-1."""
+        """States that are entered, (S, A) integers in 0..S-1."""
         ...
 
     @property
     def reward(self) -> Any:
-        """(S, A) observed reward."""
+        """Observed reward, (S, A)."""
         ...
 
     @property
     def terminal(self) -> Any:
-        """(S, A), whether the step ends the episode."""
+        """Whether the step ends the episode, (S, A) booleans."""
         ...
 
     @property
     def start(self) -> Any:
-        """Starting state."""
+        """Starting state, an integer."""
         ...
 
     @property
     def horizon(self) -> Any:
-        """Steps after which an episode is cut off."""
+        """Steps after which an episode is cut off, an integer."""
         ...
 
 
@@ -53,12 +62,12 @@ class FixedPoint(NamedTuple):
     """A fixed point by value iteration.
 
     Attributes:
-        q: (S, A) values.
+        q: Values.
         residuals: Largest change of a value in each sweep; one entry per sweep.
     """
 
-    q: np.ndarray
-    residuals: np.ndarray
+    q: Float[np.ndarray, "S A"]
+    residuals: Float[np.ndarray, " sweeps"]
 
 
 class GreedyPath(NamedTuple):
@@ -90,20 +99,20 @@ class Expansion(NamedTuple):
         supremum: Its limit for a vanishing gap: lambda alpha |r - b| s + gamma, with s the largest standard
             deviation of N numbers in [-1, 1] (and no gamma where the step is terminal).
         place: The (state, action) at which the heads are made to disagree.
-        first: (S, A, N) ensemble in which all heads agree.
-        second: (S, A, N) ensemble at distance ``gap`` from it.
+        first: Ensemble of N heads that all agree.
+        second: Ensemble at distance ``gap`` from it.
     """
 
     ratio: float
     supremum: float
     place: tuple[int, int]
-    first: np.ndarray
-    second: np.ndarray
+    first: Float[np.ndarray, "S A N"]
+    second: Float[np.ndarray, "S A N"]
 
 
 def _tables(
     next_state: Any, reward: Any, terminal: Any, gamma: float, weight: Any = 1.0, anchor: Any = 0.0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[Integer[np.ndarray, "S A"], Float[np.ndarray, "S A"], Float[np.ndarray, "S A"]]:
     """Check the tables; return (next_state, b + w (r - b), gamma where the episode goes on and 0 elsewhere)."""
     _checks.number("gamma", gamma, low=0, high=1)
     if gamma == 1:
@@ -129,7 +138,7 @@ def _tables(
     return entered, learned, np.where(ends, 0.0, gamma)
 
 
-def _like(field: str, value: Any, table: np.ndarray) -> np.ndarray:
+def _like(field: str, value: Any, table: Float[np.ndarray, "S A"]) -> Float[np.ndarray, "*any"]:
     """Return a number or an (S, A) table as a float array that broadcasts to ``table``."""
     array = _checks.as_numpy(field, value)
     if array.ndim != 0:
@@ -137,29 +146,38 @@ def _like(field: str, value: Any, table: np.ndarray) -> np.ndarray:
     return array
 
 
-def _apply(q: np.ndarray, learned: np.ndarray, entered: np.ndarray, onwards: np.ndarray) -> np.ndarray:
+def _apply(
+    q: Float[np.ndarray, "*batch S A"],
+    learned: Float[np.ndarray, "S A"],
+    entered: Integer[np.ndarray, "S A"],
+    onwards: Float[np.ndarray, "S A"],
+) -> Float[np.ndarray, "*batch S A"]:
     return learned + onwards * q.max(axis=-1)[..., entered]
 
 
 def backup(
-    q: np.ndarray,
-    reward: np.ndarray,
-    weight: Weight,
-    next_state: np.ndarray,
-    terminal: np.ndarray,
+    q: Float[np.ndarray, "*batch S A"],
+    reward: Real[np.ndarray, "S A"],
+    weight: float | Float[np.ndarray, "S A"],
+    next_state: Integer[np.ndarray, "S A"],
+    terminal: Bool[np.ndarray, "S A"],
     gamma: float,
-    anchor: Weight = 0.0,
-) -> np.ndarray:
+    anchor: float | Float[np.ndarray, "S A"] = 0.0,
+) -> Float[np.ndarray, "*batch S A"]:
     """Apply T_lambda once (A21); with ``weight`` 1 the standard operator (A22).
 
+    Examples:
+        >>> backup(np.zeros((2, 2)), reward, 0.5, next_state, terminal, gamma=0.9).tolist()
+        [[0.0, 0.5], [1.0, 1.0]]
+
     Args:
-        q: (..., S, A) values; leading axes are independent tables.
-        reward: (S, A) observed reward.
-        weight: (S, A) or a number, >= 0: the filter's weight.
-        next_state: (S, A) integers in 0..S-1.
-        terminal: (S, A) booleans.
+        q: Values; leading axes are independent tables.
+        reward: Observed reward.
+        weight: The filter's weight, >= 0.
+        next_state: States that are entered, in 0..S-1.
+        terminal: Whether the step ends the episode.
         gamma: Discount in [0, 1).
-        anchor: (S, A) or a number: the pessimistic reward b; 0 is the paper's form.
+        anchor: The pessimistic reward b; 0 is the paper's form.
 
     Returns:
         A new array of the shape of ``q``.
@@ -176,13 +194,13 @@ def backup(
 
 
 def fixed_point(
-    reward: np.ndarray,
-    weight: Weight,
-    next_state: np.ndarray,
-    terminal: np.ndarray,
+    reward: Real[np.ndarray, "S A"],
+    weight: float | Float[np.ndarray, "S A"],
+    next_state: Integer[np.ndarray, "S A"],
+    terminal: Bool[np.ndarray, "S A"],
     gamma: float,
-    anchor: Weight = 0.0,
-    start: np.ndarray | None = None,
+    anchor: float | Float[np.ndarray, "S A"] = 0.0,
+    start: Float[np.ndarray, "S A"] | None = None,
     tolerance: float = 1e-10,
     max_sweeps: int = 100_000,
 ) -> FixedPoint:
@@ -191,14 +209,18 @@ def fixed_point(
     The residuals fall at least by the factor gamma per sweep, and the result is within
     ``tolerance`` / (1 - gamma) of the fixed point. For the values alone ``solve`` is faster and exact.
 
+    Examples:
+        >>> fixed_point(reward, 1.0, next_state, terminal, gamma=0.9).q.tolist()
+        [[1.8, 1.0], [2.0, 2.0]]
+
     Args:
-        reward: (S, A) observed reward.
-        weight: (S, A) or a number, >= 0; held constant ("frozen").
-        next_state: (S, A) integers in 0..S-1.
-        terminal: (S, A) booleans.
+        reward: Observed reward.
+        weight: The filter's weight, >= 0, held constant ("frozen").
+        next_state: States that are entered, in 0..S-1.
+        terminal: Whether the step ends the episode.
         gamma: Discount in [0, 1).
         anchor: The pessimistic reward b.
-        start: (S, A) values to start from.
+        start: Values to start from.
         tolerance: Stop when no value changes by more than this, > 0.
         max_sweeps: Give up after so many sweeps, >= 1.
 
@@ -225,24 +247,40 @@ def fixed_point(
 
 
 def solve(
-    reward: np.ndarray,
-    weight: Weight,
-    next_state: np.ndarray,
-    terminal: np.ndarray,
+    reward: Real[np.ndarray, "S A"],
+    weight: float | Float[np.ndarray, "S A"],
+    next_state: Integer[np.ndarray, "S A"],
+    terminal: Bool[np.ndarray, "S A"],
     gamma: float,
-    anchor: Weight = 0.0,
-) -> np.ndarray:
-    """Return the same fixed point, (S, A), by policy iteration: exact to rounding, and much faster than sweeps.
+    anchor: float | Float[np.ndarray, "S A"] = 0.0,
+) -> Float[np.ndarray, "S A"]:
+    """Return the same fixed point by policy iteration: exact to rounding, and much faster than sweeps.
 
-    Arguments as for ``fixed_point``.
+    Examples:
+        >>> solve(reward, 1.0, next_state, terminal, gamma=0.9).tolist()
+        [[1.8, 1.0], [2.0, 2.0]]
+
+    Args:
+        reward: Observed reward.
+        weight: The filter's weight, >= 0, held constant.
+        next_state: States that are entered, in 0..S-1.
+        terminal: Whether the step ends the episode.
+        gamma: Discount in [0, 1).
+        anchor: The pessimistic reward b.
+
+    Raises:
+        InvalidValueError: naming the argument, its value and what is allowed.
     """
     entered, learned, onwards = _tables(next_state, reward, terminal, gamma, weight, anchor)
     return _solve(entered, learned, onwards, np.zeros(len(learned), int))[0]
 
 
 def _solve(
-    entered: np.ndarray, learned: np.ndarray, onwards: np.ndarray, policy: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    entered: Integer[np.ndarray, "S A"],
+    learned: Float[np.ndarray, "S A"],
+    onwards: Float[np.ndarray, "S A"],
+    policy: Integer[np.ndarray, " S"],
+) -> tuple[Float[np.ndarray, "S A"], Integer[np.ndarray, " S"]]:
     """Policy iteration from a first guess; returns (values, policy)."""
     rows = np.arange(len(learned))
     slack = 1e-12 * max(1.0, float(np.abs(learned).max()))
@@ -254,8 +292,10 @@ def _solve(
         policy = np.where(better, q.argmax(axis=1), policy)
 
 
-def _evaluate(entered: np.ndarray, learned: np.ndarray, onwards: np.ndarray) -> np.ndarray:
-    """Return the (S,) values of one policy; each round doubles the number of steps that they look ahead."""
+def _evaluate(
+    entered: Integer[np.ndarray, " S"], learned: Float[np.ndarray, " S"], onwards: Float[np.ndarray, " S"]
+) -> Float[np.ndarray, " S"]:
+    """Return the values of one policy; each round doubles the number of steps that they look ahead."""
     value, factor, ahead = learned, onwards, entered
     gamma = float(onwards.max())
     for _ in range(int(np.ceil(np.log2(np.log(1e-18) / np.log(gamma)))) if gamma > 1e-18 else 0):
@@ -264,12 +304,12 @@ def _evaluate(entered: np.ndarray, learned: np.ndarray, onwards: np.ndarray) -> 
 
 
 def contraction_ratio(
-    reward: np.ndarray,
-    weight: Weight,
-    next_state: np.ndarray,
-    terminal: np.ndarray,
+    reward: Real[np.ndarray, "S A"],
+    weight: float | Float[np.ndarray, "S A"],
+    next_state: Integer[np.ndarray, "S A"],
+    terminal: Bool[np.ndarray, "S A"],
     gamma: float,
-    anchor: Weight = 0.0,
+    anchor: float | Float[np.ndarray, "S A"] = 0.0,
     pairs: int = 1000,
     scale: float = 10.0,
     seed: int = 0,
@@ -279,16 +319,23 @@ def contraction_ratio(
     Theorem 1 (J5) says that it is at most gamma. Half of the pairs are independent normal tables, the other half
     differ by one number added everywhere, for which the ratio is gamma itself unless every step is terminal.
 
+    Examples:
+        >>> round(contraction_ratio(reward, 0.5, next_state, terminal, gamma=0.9), 6)
+        0.9
+
     Args:
-        reward: (S, A) observed reward.
-        weight: (S, A) or a number, >= 0.
-        next_state: (S, A) integers in 0..S-1.
-        terminal: (S, A) booleans.
+        reward: Observed reward.
+        weight: The filter's weight, >= 0, held constant.
+        next_state: States that are entered, in 0..S-1.
+        terminal: Whether the step ends the episode.
         gamma: Discount in [0, 1).
         anchor: The pessimistic reward b.
         pairs: Number of pairs, >= 1.
         scale: Standard deviation of the values, > 0.
         seed: Seed of the random tables.
+
+    Raises:
+        InvalidValueError: naming the argument, its value and what is allowed.
     """
     entered, learned, onwards = _tables(next_state, reward, terminal, gamma, weight, anchor)
     _checks.whole("pairs", pairs, low=1)
@@ -303,31 +350,38 @@ def contraction_ratio(
 
 
 def ensemble_backup(
-    heads: np.ndarray,
-    reward: np.ndarray,
-    next_state: np.ndarray,
-    terminal: np.ndarray,
+    heads: Float[np.ndarray, "S A N"],
+    reward: Real[np.ndarray, "S A"],
+    next_state: Integer[np.ndarray, "S A"],
+    terminal: Bool[np.ndarray, "S A"],
     gamma: float,
-    sigma_h: Weight = 0.0,
+    sigma_h: float | Float[np.ndarray, "S A"] = 0.0,
     reliability: ReliabilityFilter | None = None,
-    anchor: Weight = 0.0,
+    anchor: float | Float[np.ndarray, "S A"] = 0.0,
     ddof: int = 1,
-) -> np.ndarray:
+) -> Float[np.ndarray, "S A N"]:
     """Apply T_lambda with *live* weights: every head is backed up with w(sigma_m(heads), sigma_h).
 
+    Examples:
+        >>> ensemble_backup(np.zeros((2, 2, 3)), reward, next_state, terminal, gamma=0.9)[1, 0].tolist()
+        [2.0, 2.0, 2.0]
+
     Args:
-        heads: (S, A, N) values of N heads.
-        reward: (S, A) observed reward.
-        next_state: (S, A) integers in 0..S-1.
-        terminal: (S, A) booleans.
+        heads: Values of N heads.
+        reward: Observed reward.
+        next_state: States that are entered, in 0..S-1.
+        terminal: Whether the step ends the episode.
         gamma: Discount in [0, 1).
-        sigma_h: (S, A) or a number, >= 0.
+        sigma_h: The annotators' disagreement, >= 0.
         reliability: The filter; the paper's if left out.
         anchor: The pessimistic reward b.
         ddof: 1 for 1/(N-1) as the paper prints (A17), 0 for 1/N.
 
     Returns:
-        (S, A, N) values.
+        Values of N heads, a new array.
+
+    Raises:
+        InvalidValueError: naming the argument, its value and what is allowed.
     """
     _checks.finite("heads", heads)
     values = _checks.as_numpy("heads", heads)
@@ -344,9 +398,9 @@ def ensemble_backup(
 
 
 def live_weight_expansion(
-    reward: np.ndarray,
-    next_state: np.ndarray,
-    terminal: np.ndarray,
+    reward: Real[np.ndarray, "S A"],
+    next_state: Integer[np.ndarray, "S A"],
+    terminal: Bool[np.ndarray, "S A"],
     gamma: float,
     lam: float = 2.0,
     alpha: float = 0.5,
@@ -362,10 +416,14 @@ def live_weight_expansion(
     weight, and all values of the state that follows move by gap in the same direction as the filtered reward. The
     reward's part of the step then grows as lambda alpha |r - b| sigma_m with sigma_m up to 1.095 gap (N = 5).
 
+    Examples:
+        >>> round(live_weight_expansion(reward, next_state, terminal, gamma=0.9, lam=2.0, alpha=0.5).supremum, 2)
+        2.19
+
     Args:
-        reward: (S, A) observed reward.
-        next_state: (S, A) integers in 0..S-1.
-        terminal: (S, A) booleans.
+        reward: Observed reward.
+        next_state: States that are entered, in 0..S-1.
+        terminal: Whether the step ends the episode.
         gamma: Discount in [0, 1).
         lam: lambda >= 0 of the reciprocal filter.
         alpha: Weight of sigma_m in [0, 1].
@@ -374,6 +432,9 @@ def live_weight_expansion(
         place: The (state, action) to disagree at; the worst one if left out.
         anchor: The pessimistic reward b.
         ddof: 1 for 1/(N-1), 0 for 1/N.
+
+    Raises:
+        InvalidValueError: naming the argument, its value and what is allowed.
     """
     _, learned, onwards = _tables(next_state, reward, terminal, gamma, 1.0, anchor)
     _checks.whole("heads", heads, low=2)
@@ -400,25 +461,41 @@ def live_weight_expansion(
     return Expansion(ratio, float((slope + onwards)[state, action]), (state, action), first, second)
 
 
-def greedy_actions(q: np.ndarray) -> np.ndarray:
+def greedy_actions(q: Float[np.ndarray, "*batch A"]) -> Integer[np.ndarray, "*batch"]:
     """Return the best action of every state; of equally good ones (to 1e-9) the first.
 
+    Examples:
+        >>> greedy_actions(np.array([[1.8, 1.0], [2.0, 2.0]])).tolist()
+        [0, 0]
+
     Args:
-        q: (S, A) values or scores.
+        q: Values or scores.
     """
     return np.argmax(q >= q.max(axis=-1, keepdims=True) - _TIE, axis=-1)
 
 
 def greedy_path(
-    q: np.ndarray, task: TabularTask, hack: np.ndarray | None = None, horizon: int | None = None
+    q: Float[np.ndarray, "S A"],
+    task: TabularTask,
+    hack: Bool[np.ndarray, "S A"] | None = None,
+    horizon: int | None = None,
 ) -> GreedyPath:
     """Follow the greedy policy from the start until a terminal step or the horizon.
 
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> task = SimpleNamespace(next_state=next_state, reward=reward, terminal=terminal, start=0, horizon=10)
+        >>> greedy_path(np.array([[1.8, 1.0], [2.0, 2.0]]), task).states
+        (0, 1, 1)
+
     Args:
-        q: (S, A) values or scores.
+        q: Values or scores.
         task: The task.
-        hack: (S, A) booleans: the contested steps to count; none if left out.
+        hack: The contested steps to count; none if left out.
         horizon: Steps at most, >= 1; the task's if left out.
+
+    Raises:
+        InvalidValueError: naming the argument, its value and what is allowed.
     """
     _checks.finite("q", q)
     values = _checks.as_numpy("q", q)
@@ -432,9 +509,15 @@ def greedy_path(
 
 
 def _follow(
-    policy: np.ndarray, entered: np.ndarray, ends: np.ndarray, contested: np.ndarray, start: int, steps: int
+    policy: Integer[np.ndarray, " S"],
+    entered: Integer[np.ndarray, "S A"],
+    ends: Bool[np.ndarray, "S A"],
+    contested: Bool[np.ndarray, "S A"],
+    start: int,
+    steps: int,
 ) -> GreedyPath:
-    states, actions, done = [start], [], False
+    states, done = [start], False
+    actions: list[int] = []
     visits = dict.fromkeys(np.unique(entered[contested]).tolist(), 0)
     while len(actions) < steps and not done:
         s, a = states[-1], int(policy[states[-1]])
@@ -448,13 +531,13 @@ def _follow(
 
 def critical_lambda(
     task: TabularTask,
-    hack: np.ndarray,
-    sigma_h: np.ndarray,
+    hack: Bool[np.ndarray, "S A"],
+    sigma_h: float | Float[np.ndarray, "S A"],
     *,
     gamma: float = 0.95,
     beta: float = 0.5,
     form: Form = "reciprocal",
-    anchor: Weight = 0.0,
+    anchor: float | Float[np.ndarray, "S A"] = 0.0,
     visits_allowed: int | None = None,
     high: float = 1e4,
     precision: float = 1e-5,
@@ -468,10 +551,19 @@ def critical_lambda(
     Lambda = 0 and 4 values per decade from 0.01 to ``high`` are tried in turn; the first that works is refined by
     bisection. An island of success narrower than that grid can be missed.
 
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> trap = np.array([[4.0, 2.0]])  # action 0 stays for ever at a contested 4, action 1 ends the episode
+        >>> stay, end = np.array([[0, 0]]), np.array([[False, True]])
+        >>> task = SimpleNamespace(next_state=stay, reward=trap, terminal=end, start=0, horizon=10)
+        >>> sigma_h = np.array([[1.0, 0.0]])
+        >>> round(critical_lambda(task, ~end, sigma_h, gamma=0.5), 2)  # 4 w / (1 - gamma) = 2: w = 1/4, lambda / 2 = 3
+        6.0
+
     Args:
         task: The task.
-        hack: (S, A) booleans: contested steps.
-        sigma_h: (S, A) or a number, >= 0: the annotators' disagreement.
+        hack: Contested steps.
+        sigma_h: The annotators' disagreement, >= 0.
         gamma: Discount in [0, 1).
         beta: Weight of sigma_h in [0, 1].
         form: Which weight, a name in ``uard.method.weights.FORMS``.
@@ -479,6 +571,9 @@ def critical_lambda(
         visits_allowed: Contested steps that the path may still contain; any number if left out.
         high: Largest lambda tried, > 0.01.
         precision: Relative precision of the result, > 0.
+
+    Raises:
+        InvalidValueError: naming the argument, its value and what is allowed.
     """
     _checks.number("high", high, low=0.01, open_low=True)
     _checks.number("precision", precision, low=0, open_low=True)
@@ -497,12 +592,12 @@ def critical_lambda(
 
 def _stopper(
     task: TabularTask,
-    hack: np.ndarray,
-    sigma_h: Weight,
+    hack: Bool[np.ndarray, "S A"],
+    sigma_h: float | Float[np.ndarray, "S A"],
     gamma: float,
     beta: float,
     form: Form,
-    anchor: Weight,
+    anchor: float | Float[np.ndarray, "S A"],
     visits_allowed: int | None,
 ) -> Callable[[float], bool]:
     """Return the question "does the fixed point at this lambda stop hacking?"; it remembers the last policy."""

@@ -5,58 +5,46 @@ NumPy functions for evaluation: they read the true reward, so no agent may call 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uard import _checks
 
-
-class Reliability(NamedTuple):
-    """A reliability diagram: bins of equal count, ordered by sigma."""
-
-    sigma: np.ndarray
-    error: np.ndarray
-    count: Any  # an array; tuple has a method of that name
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 
-def _pair(name_a: str, a: object, name_b: str, b: object, least: int = 2) -> tuple[np.ndarray, np.ndarray]:
+def _pair(name_a: str, a: object, name_b: str, b: object) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     x, y = _checks.as_numpy(name_a, a), _checks.as_numpy(name_b, b)
     _checks.finite(name_a, x)
     _checks.finite(name_b, y)
     _checks.same_shape(name_a, x, name_b, y)
-    if x.size < least:
-        raise _checks.InvalidValueError(f"{name_a}.size", x.size, f">= {least}")
+    if x.size < 2:
+        raise _checks.InvalidValueError(f"{name_a}.size", x.size, ">= 2")
     return x.ravel(), y.ravel()
 
 
-def reliability_diagram(sigma: object, error: object, bins: int = 10) -> Reliability:
-    """Mean |error| in bins of equal count, ordered by sigma.
-
-    Args:
-        sigma: Uncertainties, any shape.
-        error: |proxy - true| of the same state-actions.
-        bins: Number of bins; fewer where there are fewer points.
-    """
-    x, y = _pair("sigma", sigma, "error", error)
-    _checks.nonnegative("error", error)
-    _checks.whole("bins", bins, low=1)
-    parts = [p for p in np.array_split(np.argsort(x, kind="stable"), min(bins, x.size)) if p.size]
-    return Reliability(
-        np.array([x[p].mean() for p in parts]),
-        np.array([y[p].mean() for p in parts]),
-        np.array([p.size for p in parts]),
-    )
-
-
-def _ranks(x: np.ndarray) -> np.ndarray:
+def _ranks(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     _, inverse, counts = np.unique(x, return_inverse=True, return_counts=True)
     ends = np.cumsum(counts)
     return (ends - (counts - 1) / 2.0)[inverse]
 
 
 def spearman(sigma: object, error: object) -> float:
-    """Rank correlation of sigma and |error| in [-1, 1], ties averaged; 0 if either is constant."""
+    """Rank correlation of sigma and |error| in [-1, 1], ties averaged; 0 if either is constant.
+
+    Examples:
+        >>> spearman(sigma=[0.1, 0.2, 0.9], error=[0.0, 1.0, 5.0])
+        1.0
+
+    Args:
+        sigma: Uncertainties, at least two, an array of any shape or a list.
+        error: |proxy - true| of the same state-actions, of the same shape.
+
+    Raises:
+        InvalidValueError: for other shapes, fewer than two numbers, or one that is not finite.
+    """
     x, y = _pair("sigma", sigma, "error", error)
     a, b = _ranks(x), _ranks(y)
     a, b = a - a.mean(), b - b.mean()
@@ -65,10 +53,19 @@ def spearman(sigma: object, error: object) -> float:
 
 
 def auroc(score: object, hack: object) -> float:
-    """Chance that a hack gets a higher score (e.g. 1 - w) than an honest step, ties counted half.
+    """Chance in [0, 1] that a hack gets a higher score (e.g. 1 - w) than an honest step, ties counted half.
+
+    Examples:
+        >>> auroc(score=[0.9, 0.2, 0.1], hack=[True, False, False])
+        1.0
+
+    Args:
+        score: At least two numbers, an array of any shape or a list.
+        hack: Which of them are hacks (bool), of the same shape.
 
     Raises:
-        InvalidValueError: if there are no hacks or nothing but hacks.
+        InvalidValueError: for other shapes, fewer than two numbers, one that is not finite, no hack or nothing but
+            hacks.
     """
     x, y = _pair("score", score, "hack", hack)
     positive = y > 0.5
@@ -76,16 +73,3 @@ def auroc(score: object, hack: object) -> float:
     if hits == 0 or rest == 0:
         raise _checks.InvalidValueError("hack", f"{hits} of {x.size} true", "of both kinds")
     return float((_ranks(x)[positive].sum() - hits * (hits + 1) / 2) / (hits * rest))
-
-
-def tpr_at_fpr(score: object, hack: object, fpr: float = 0.01) -> float:
-    """Share of hacks above the lowest threshold that at most ``fpr`` of the honest steps exceed."""
-    x, y = _pair("score", score, "hack", hack)
-    _checks.number("fpr", fpr, low=0, high=1)
-    positive = y > 0.5
-    if positive.all() or not positive.any():
-        raise _checks.InvalidValueError("hack", f"{int(positive.sum())} of {x.size} true", "of both kinds")
-    honest = np.sort(x[~positive])[::-1]
-    allowed = int(np.floor(fpr * honest.size + 1e-9))  # 0.29 * 100 is 28.999...
-    threshold = honest[allowed] if allowed < honest.size else -np.inf
-    return float((x[positive] > threshold).mean())

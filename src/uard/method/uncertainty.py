@@ -8,12 +8,18 @@ from __future__ import annotations
 import contextlib
 import math
 import warnings
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from uard import _checks
-from uard.method.arrays import Array, namespace
+from uard.method.arrays import Array, Numbers, namespace, where
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+
+_NUMPY: tuple[type[Any], ...] = (np.ndarray, np.generic)
 
 
 class OneAnnotatorWarning(UserWarning):
@@ -23,10 +29,17 @@ class OneAnnotatorWarning(UserWarning):
 def sigma_model(values: Array, axis: int = -1, ddof: int = 1) -> Array:
     """sigma_m: standard deviation over the members of an ensemble (A12, A17).
 
+    Examples:
+        >>> float(sigma_model([1.0, 3.0, 5.0]))
+        2.0
+
     Args:
-        values: Estimates of the members, e.g. (..., N) with N members on ``axis``.
+        values: Estimates of the members, e.g. (..., N) with N members on ``axis``; a list will do.
         axis: The axis of the members.
         ddof: 1 for the paper's 1/(N-1), 0 for 1/N.
+
+    Returns:
+        An array without that axis, in the unit of the values.
 
     Raises:
         InvalidValueError: if a value is not finite or there are no more than ``ddof`` members.
@@ -46,14 +59,23 @@ def sigma_human(
 ) -> Array:
     """sigma_h: standard deviation over the annotators' ratings of one state-action (A14, A18).
 
+    Examples:
+        >>> round(float(sigma_human([-1.0, 2.0, 1.0])), 4)
+        1.2472
+        >>> float(sigma_human([-1.0, 2.0, 7.0], mask=[True, False, True]))
+        4.0
+
     Args:
-        ratings: Ratings, e.g. (..., K) with K annotators on ``axis``.
+        ratings: Ratings, e.g. (..., K) with K annotators on ``axis``; a list will do.
         axis: The axis of the annotators.
         ddof: 0, the population form, is what the paper's number 1.247 needs ({-1, 2, 1}); its equation (A14)
             prints 1.
         mask: True where a rating exists; same shape. Masked-out entries may hold anything, NaN included.
         empty: What to return where no more than ``ddof`` ratings exist. Without it such a place is an error (NaN
             inside a JAX transformation, which can raise none).
+
+    Returns:
+        An array without that axis, in the unit of the ratings.
 
     Raises:
         InvalidValueError: for NaN, infinity or ``None`` where a rating should be, a mask of another shape, no
@@ -88,9 +110,9 @@ def sigma_human(
     return _masked_std(ratings, here if xp.isdtype(here.dtype, "bool") else here != 0, axis, ddof, empty)
 
 
-def _floats(field: str, values: Array, mask: Array | None = None) -> Array:
+def _floats(field: str, values: Any, mask: Array | None = None) -> Float[Array, "*rest"]:
     """Return an array of floats: lists become NumPy's, integers (stars, thumbs) become floats."""
-    if not hasattr(values, "shape") or (isinstance(values, np.ndarray | np.generic) and values.dtype.kind != "f"):
+    if not hasattr(values, "shape") or (isinstance(values, _NUMPY) and values.dtype.kind != "f"):
         if mask is not None:
             with contextlib.suppress(ValueError):  # rows of unequal length: the check below says so
                 cells = np.asarray(values, dtype=object)
@@ -100,22 +122,34 @@ def _floats(field: str, values: Array, mask: Array | None = None) -> Array:
     return values if xp.isdtype(values.dtype, "real floating") else xp.astype(values, xp.asarray(0.0).dtype)
 
 
-def deviation(values: Array, axis: int, ddof: int) -> Array:
-    """Standard deviation along an axis, nothing checked; its gradient where all agree is 0, see ``root``."""
+def deviation(values: Float[Array, "*any"], axis: int, ddof: int) -> Float[Array, "*rest"]:
+    """Standard deviation along an axis, nothing checked; its gradient where all agree is 0, see ``root``.
+
+    Examples:
+        >>> deviation(np.array([[1.0, 3.0], [2.0, 2.0]]), axis=-1, ddof=0).tolist()
+        [1.0, 0.0]
+    """
     xp = namespace(values)
-    centre = xp.mean(values, axis=axis, keepdims=True)
-    square = (values - centre) * (values - centre)
-    return root(xp.sum(square, axis=axis) / (values.shape[axis] - ddof))
+    size = values.shape[axis]
+    gap = values - xp.sum(values, axis=axis, keepdims=True) / size
+    return root(xp.sum(gap * gap, axis=axis) / (size - ddof))
 
 
-def root(variance: Array) -> Array:
-    """Return the square root; its gradient where all agree is 0, not infinite: an actor may climb a score of it."""
+def root(variance: Float[Array, "*any"]) -> Float[Array, "*any"]:
+    """Return the square root; its gradient where all agree is 0, not infinite: an actor may climb a score of it.
+
+    Examples:
+        >>> root(np.array([0.0, 4.0])).tolist()
+        [0.0, 2.0]
+    """
     xp = namespace(variance)
-    apart = xp.where(variance == 0, xp.ones_like(variance), xp.zeros_like(variance))
-    return xp.sqrt(variance + apart) - apart
+    agreed = xp.astype(variance == 0, variance.dtype)
+    return xp.sqrt(variance + agreed) - agreed
 
 
-def _masked_std(ratings: Array, mask: Array, axis: int, ddof: int, empty: float | None) -> Array:
+def _masked_std(
+    ratings: Float[Array, "*any"], mask: Bool[Array, "*any"], axis: int, ddof: int, empty: float | None
+) -> Float[Array, "*rest"]:
     xp = namespace(ratings)
     values = xp.where(mask, ratings, xp.zeros_like(ratings))
     _checks.finite("ratings", values)
@@ -139,58 +173,91 @@ def _enough(what: str, count: int, ddof: int) -> None:
         raise _checks.InvalidValueError(f"number of {what}", count, f"more than ddof = {ddof}")
 
 
-def with_proxy(mean: Array, sigma: Array, proxy: Array, raters: Array) -> Array:
+def with_proxy(mean: Numbers, sigma: Numbers, proxy: Numbers, raters: Numbers) -> Array:
     """sigma_h over K ratings *and* the observed reward, the proxy counted as one more rater.
 
     The population standard deviation of the union, from its parts: with K ratings of mean m and deviation s,
     var = K/(K+1) s^2 + K/(K+1)^2 (m - r)^2. Its second term is the plainest sign that a reward lies.
 
+    Examples:
+        >>> with_proxy(mean=1.0, sigma=0.0, proxy=4.0, raters=2)  # the deviation of {1, 1, 4}
+        1.4142135623730951
+
     Args:
-        mean: Mean rating m.
-        sigma: Population deviation s of the ratings, >= 0.
-        proxy: Observed reward r.
+        mean: Mean rating m, in reward units.
+        sigma: Population deviation s of the ratings, in reward units, >= 0.
+        proxy: Observed reward r, in reward units.
         raters: Number of annotators K >= 1.
+
+    Returns:
+        The deviation in reward units, of the shape that all broadcast to.
     """
-    share = raters / (raters + 1.0)
+    union = raters + 1.0
+    share = raters / union
     gap = mean - proxy
-    variance = share * (sigma * sigma) + share / (raters + 1.0) * (gap * gap)
+    variance = share * (sigma * sigma) + share / union * (gap * gap)
     return namespace(variance).sqrt(variance) if hasattr(variance, "shape") else variance**0.5
 
 
-def shrink(sigma: Array, count: Array, prior: Array, strength: Array = 1.0) -> Array:
-    """(n sigma + n0 prior) / (n + n0): a deviation from few ratings, drawn towards what is usual.
+def shrink(sigma: Numbers, count: Numbers, prior: Numbers, strength: Numbers = 1.0) -> Array:
+    """(n sigma + n0 prior) / (n + n0): a statistic of few ratings, drawn towards its mean over all state-actions.
+
+    Examples:
+        >>> shrink(sigma=4.0, count=3, prior=0.0, strength=1.0)
+        3.0
 
     Args:
         sigma: Estimate from ``count`` rated visits; means nothing (may be NaN) where that is 0.
         count: Number of rated visits n >= 0.
-        prior: What is usual, e.g. the mean over all state-actions.
+        prior: What is expected without any rating, e.g. the mean over all state-actions.
         strength: Pseudo-count n0 >= 0; with n0 = 0 nothing is shrunk (and n = 0 gives the prior).
+
+    Returns:
+        A number between estimate and prior, of the shape that all broadcast to.
     """
     total = count + strength
     if not hasattr(total, "shape"):
         return prior if count == 0 else (count * sigma + strength * prior) / total
+    n = count + 0.0 * strength  # an array, even if only the strength is one
+    known = where(n > 0, n * sigma, 0.0) + strength * prior
+    if isinstance(strength, float) and strength > 0:  # then the total is nowhere 0
+        return known / total
     xp = namespace(total, sigma)
-    safe = xp.where(total > 0, total, xp.ones_like(total))
-    heard = xp.where(count + 0.0 * total > 0, count * sigma, xp.zeros_like(total))
-    return xp.where(total > 0, (heard + strength * prior) / safe, prior + 0.0 * total)
+    return xp.where(total > 0, known / xp.where(total > 0, total, xp.ones_like(total)), prior + 0.0 * total)
 
 
 class Location(NamedTuple):
-    """Mean and mean absolute deviation of a quantity over distinct state-actions."""
+    """Mean and mean absolute deviation of a quantity over distinct state-actions, in its unit."""
 
-    location: Array
-    mad: Array
+    location: Float[Array, ""] | float
+    mad: Float[Array, ""] | float
 
 
-def location_and_mad(values: Array, mask: Array) -> Location:
+def location_and_mad(values: Float[Array, "*batch"], mask: Bool[Array, "*batch"]) -> Location:
     """Mean and mean absolute deviation of the masked-in values; both 0 if there are none.
 
     Taken over *distinct* state-actions: an agent that sits in a trap must not dilute its own alarm.
+
+    Examples:
+        >>> [float(x) for x in location_and_mad(np.array([1.0, 3.0, 99.0]), np.array([True, True, False]))]
+        [2.0, 1.0]
+
+    Args:
+        values: One per state-action; what is masked out may hold anything.
+        mask: Which of them count.
+    """
+    location = masked_mean(values, mask)
+    return Location(location, masked_mean(abs(values - location), mask))
+
+
+def masked_mean(values: Float[Array, "*batch"], mask: Bool[Array, "*batch"]) -> Float[Array, ""]:
+    """Mean of the masked-in values, 0 if there are none; what is masked out may hold anything.
+
+    Examples:
+        >>> float(masked_mean(np.array([1.0, 3.0, 99.0]), np.array([True, True, False])))
+        2.0
     """
     xp = namespace(values)
     zero = xp.zeros_like(values)
-    count = xp.sum(xp.where(mask, xp.ones_like(values), zero))
-    count = xp.where(count > 0, count, xp.ones_like(count))
-    location = xp.sum(xp.where(mask, values, zero)) / count
-    mad = xp.sum(xp.where(mask, xp.abs(values - location), zero)) / count
-    return Location(location, mad)
+    count = xp.sum(xp.astype(mask, values.dtype))
+    return xp.sum(xp.where(mask, values, zero)) / xp.where(count > 0, count, xp.ones_like(count))

@@ -7,26 +7,34 @@ weights are dimensionless and lie in (0, 1] unless a docstring says otherwise.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from uard import _checks
-from uard.method.arrays import Array, namespace
+from uard.method.arrays import Array, Numbers, namespace
 
 Form = Literal["reciprocal", "exponential", "linear", "certainty-equivalent", "wiener"]
 FORMS: tuple[Form, ...] = ("reciprocal", "exponential", "linear", "certainty-equivalent", "wiener")
 
 
-def total_uncertainty(sigma_m: Array, sigma_h: Array, alpha: Array = 0.5, beta: Array = 0.5) -> Array:
+def total_uncertainty(sigma_m: Numbers, sigma_h: Numbers, alpha: Numbers = 0.5, beta: Numbers = 0.5) -> Array:
     """U = alpha sigma_m + beta sigma_h (A24; section 3.6.1).
+
+    Examples:
+        >>> total_uncertainty(sigma_m=1.0, sigma_h=2.0)
+        1.5
 
     Args:
         sigma_m: Ensemble disagreement, >= 0, any shape.
         sigma_h: Annotator disagreement, >= 0, broadcastable to ``sigma_m``.
-        alpha: Weight of ``sigma_m`` in [0, 1].
-        beta: Weight of ``sigma_h`` in [0, 1].
+        alpha: Weight of ``sigma_m``, a number in [0, 1].
+        beta: Weight of ``sigma_h``, a number in [0, 1].
+
+    Returns:
+        U >= 0, of the shape that both broadcast to.
 
     Raises:
         InvalidValueError: for a negative or non-finite sigma, or alpha or beta outside [0, 1].
@@ -38,25 +46,48 @@ def total_uncertainty(sigma_m: Array, sigma_h: Array, alpha: Array = 0.5, beta: 
     return alpha * sigma_m + beta * sigma_h
 
 
-def reciprocal_weight(u: Array, lam: Array = 2.0) -> Array:
-    """w = 1 / (1 + lambda U), the paper's filter (A29, A37)."""
+def reciprocal_weight(u: Numbers, lam: Numbers = 2.0) -> Array:
+    """w = 1 / (1 + lambda U) in (0, 1], the paper's filter (A29, A37).
+
+    Examples:
+        >>> reciprocal_weight(u=0.5, lam=2.0)
+        0.5
+
+    Args:
+        u: Total uncertainty U >= 0.
+        lam: lambda >= 0.
+    """
     return 1.0 / (1.0 + lam * u)
 
 
-def exponential_weight(u: Array, lam: Array = 2.0) -> Array:
-    """w = exp(-lambda U) (A35). Underflows to 0 where lambda U > 87 in float32."""
+def exponential_weight(u: Numbers, lam: Numbers = 2.0) -> Array:
+    """w = exp(-lambda U) in (0, 1] (A35). Underflows to 0 where lambda U > 87 in float32.
+
+    Examples:
+        >>> exponential_weight(u=0.0, lam=2.0)
+        1.0
+
+    Args:
+        u: Total uncertainty U >= 0.
+        lam: lambda >= 0.
+    """
     product = lam * u
-    if not hasattr(product, "shape"):
-        import math
-
-        return math.exp(-product)
-    return namespace(product).exp(-product)
+    return namespace(product).exp(-product) if hasattr(product, "shape") else math.exp(-product)
 
 
-def linear_weight(u: Array, mu: Array, lam: Array = 2.0) -> Array:
+def linear_weight(u: Numbers, mu: Numbers, lam: Numbers = 2.0) -> Array:
     """w such that w mu = max(0, mu - lambda U) (A34), for mu > 0; in [0, 1].
 
     The paper prints the product and calls it a weight. For mu <= 0 the product is 0, so w = 0.
+
+    Examples:
+        >>> float(linear_weight(u=0.5, mu=4.0, lam=2.0))
+        0.75
+
+    Args:
+        u: Total uncertainty U >= 0, in the unit of ``mu``.
+        mu: What is to be discounted, measured from its anchor.
+        lam: lambda >= 0.
     """
     mu = _as_array_like(u, mu)
     xp = namespace(mu)
@@ -64,11 +95,20 @@ def linear_weight(u: Array, mu: Array, lam: Array = 2.0) -> Array:
     return left / xp.where(mu > 0, mu, xp.ones_like(mu))
 
 
-def certainty_equivalent_weight(u: Array, mu: Array, kappa: Array = 2.0) -> Array:
+def certainty_equivalent_weight(u: Numbers, mu: Numbers, kappa: Numbers = 2.0) -> Array:
     """w = 1 / (1 + kappa U^2 / (2 mu)) (A28), for mu > 0; 0 for mu <= 0.
 
     As printed the weight leaves (0, 1] for mu <= 0 (mu = -0.5, U = 1.0001 gives -5000). Its limit for
     mu -> 0+ is 0, and that is what mu <= 0 gets here.
+
+    Examples:
+        >>> float(certainty_equivalent_weight(u=2.0, mu=4.0, kappa=2.0))
+        0.5
+
+    Args:
+        u: Total uncertainty U >= 0, in the unit of ``mu``.
+        mu: What is to be discounted, measured from its anchor.
+        kappa: Risk coefficient >= 0, one over the unit of ``mu``.
     """
     mu = _as_array_like(u, mu)
     xp = namespace(mu)
@@ -76,26 +116,44 @@ def certainty_equivalent_weight(u: Array, mu: Array, kappa: Array = 2.0) -> Arra
     return 2.0 * xp.maximum(mu, xp.zeros_like(mu)) / (2.0 * safe + kappa * u * u)
 
 
-def wiener_weight(signal: Array, noise: Array) -> Array:
-    """w = S / (S + N) for signal power S >= 0 and noise power N >= 0 (A32); 1 where both are 0."""
+def wiener_weight(signal: Numbers, noise: Numbers) -> Array:
+    """w = S / (S + N) in [0, 1] (A32); 1 where both are 0.
+
+    Examples:
+        >>> float(wiener_weight(signal=3.0, noise=1.0))
+        0.75
+
+    Args:
+        signal: Signal power S >= 0.
+        noise: Noise power N >= 0, in the same unit.
+    """
     total = _as_array_like(noise, signal + noise)
     xp = namespace(total)
     empty = total <= 0
     return xp.where(empty, xp.ones_like(total), signal / xp.where(empty, xp.ones_like(total), total))
 
 
-def _as_array_like(other: Array, value: Array) -> Array:
+def _as_array_like(other: Numbers, value: Numbers) -> Array:
     """Broadcast ``value`` against ``other`` so that it is an array."""
     total = value + 0.0 * other
     return total if hasattr(total, "shape") else np.asarray(total)
 
 
-def discount(value: Array, weight: Array, anchor: Array = 0.0) -> Array:
+def discount(value: Numbers, weight: Numbers, anchor: Numbers = 0.0) -> Array:
     """b + w (r - b): the value, drawn towards the anchor b where it is not believed.
 
     With b = 0 and a value estimate this is the paper's score J (A19); with b = 0 and a reward it is the reward of
     its operator T_lambda (A21). With b a pessimistic reward it keeps order and sign where the paper's form does
     not: b = 0 makes a penalty smaller.
+
+    Examples:
+        >>> discount(4.0, weight=0.25, anchor=-1.0)
+        0.25
+
+    Args:
+        value: r, a reward or a value.
+        weight: w, from 0 (the anchor is taken) to 1 (the value is).
+        anchor: b, in the unit of the value.
     """
     return anchor + weight * (value - anchor)
 
@@ -103,6 +161,13 @@ def discount(value: Array, weight: Array, anchor: Array = 0.0) -> Array:
 @dataclass(frozen=True)
 class ReliabilityFilter:
     """The filter with its parameters; the defaults are the paper's (E3, E4).
+
+    Examples:
+        >>> reliability = ReliabilityFilter(lam=2.0, alpha=0.5, beta=0.5)
+        >>> reliability.weight(sigma_m=0.0, sigma_h=1.0)
+        0.5
+        >>> reliability.score(4.0, sigma_m=0.0, sigma_h=1.0)
+        2.0
 
     Attributes:
         lam: The skepticism parameter lambda >= 0 (for ``certainty-equivalent`` it is the risk coefficient kappa).
@@ -117,28 +182,54 @@ class ReliabilityFilter:
     form: Form = "reciprocal"
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.number("lam", self.lam, low=0)
         _checks.number("alpha", self.alpha, low=0, high=1)
         _checks.number("beta", self.beta, low=0, high=1)
         _checks.choose("form", self.form, FORMS)
 
-    def weight(self, sigma_m: Array, sigma_h: Array, mu: Array | None = None, lam: Array | None = None) -> Array:
+    @property
+    def needs_mu(self) -> bool:
+        """Whether the weight depends on the size of what is discounted."""
+        return self.form not in ("reciprocal", "exponential")
+
+    def weight(
+        self, sigma_m: Numbers, sigma_h: Numbers, mu: Numbers | None = None, lam: Numbers | None = None
+    ) -> Array:
         """Return w for the two disagreements.
 
         Args:
             sigma_m: Ensemble disagreement, >= 0.
             sigma_h: Annotator disagreement, >= 0, broadcastable.
             mu: What is to be discounted, measured from its anchor; needed by the three forms that compare the
-                uncertainty with it.
+                uncertainty with it (``needs_mu``).
             lam: Use this lambda instead of the filter's own (an adaptive lambda_t, broadcastable).
+
+        Returns:
+            Weights in [0, 1], of the shape that all broadcast to.
 
         Raises:
             InvalidValueError: for bad sigmas, or a form that needs ``mu`` without it.
         """
-        u = total_uncertainty(sigma_m, sigma_h, self.alpha, self.beta)
         if lam is not None:
             _checks.nonnegative("lam", lam)
+        return self.weight_of(total_uncertainty(sigma_m, sigma_h, self.alpha, self.beta), mu, lam)
+
+    def weight_of(self, u: Numbers, mu: Numbers | None = None, lam: Numbers | None = None) -> Array:
+        """Return w for a total uncertainty, of which nothing is checked; see ``weight``.
+
+        Args:
+            u: Total uncertainty U >= 0, see ``total_uncertainty``.
+            mu: See ``weight``.
+            lam: See ``weight``.
+
+        Raises:
+            InvalidValueError: for a form that needs ``mu`` without it.
+        """
         strength = self.lam if lam is None else lam
         if self.form == "reciprocal":
             return reciprocal_weight(u, strength)
@@ -152,10 +243,22 @@ class ReliabilityFilter:
             return certainty_equivalent_weight(u, mu, strength)
         return wiener_weight(mu * mu, (strength * u) * (strength * u))
 
-    def score(self, mu: Array, sigma_m: Array, sigma_h: Array, anchor: Array = 0.0, lam: Array | None = None) -> Array:
+    def score(
+        self, mu: Numbers, sigma_m: Numbers, sigma_h: Numbers, anchor: Numbers = 0.0, lam: Numbers | None = None
+    ) -> Array:
         """J = b + w (mu - b), the confidence-adjusted action score (A19 for b = 0).
 
         The same call discounts a reward: pass the reward as ``mu``.
+
+        Args:
+            mu: Values or rewards, finite.
+            sigma_m: Ensemble disagreement, >= 0.
+            sigma_h: Annotator disagreement, >= 0.
+            anchor: b, what is drawn towards.
+            lam: See ``weight``.
+
+        Raises:
+            InvalidValueError: for a ``mu`` that is not finite; see also ``weight``.
         """
         _checks.finite("mu", mu)
         return discount(mu, self.weight(sigma_m, sigma_h, mu=mu - anchor, lam=lam), anchor)

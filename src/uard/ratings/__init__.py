@@ -1,1 +1,1 @@
-"""Ratings: who said what of which item; everything that a mitigation sees is derived from it."""
+"""Ratings: which rater gave which item which number; all that a mitigation sees is derived from them."""

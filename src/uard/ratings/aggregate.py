@@ -1,11 +1,11 @@
-"""From ratings to ``Feedback``: the only place where what several raters said becomes a mean, a lowest, a deviation.
+"""From ratings to ``Feedback``: the only place where the ratings of several become a mean, a lowest, a deviation.
 
 Pure functions of NumPy, JAX or torch arrays.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,20 +14,28 @@ from uard.method import uncertainty
 from uard.method.arrays import Array, namespace
 from uard.method.feedback import ByRater, Feedback
 
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Integer, Real
 
-def aggregate(ratings: Array, proxy: Array, mask: Array | None = None, ddof: int = 0) -> Feedback:
+
+def aggregate(
+    ratings: Real[Array, "*batch K"],
+    proxy: Float[Array, "*batch"],
+    mask: Bool[Array, "*batch K"] | None = None,
+    ddof: int = 0,
+) -> Feedback:
     """Return the feedback of one visit to each of some state-actions.
 
-        >>> import numpy as np
+    Examples:
         >>> feedback = aggregate(np.array([[-1.0, 2.0, np.nan], [np.nan, np.nan, np.nan]]), np.array([4.0, 0.0]))
         >>> feedback.count.tolist(), feedback.mean.tolist(), feedback.lowest.tolist(), feedback.raters.tolist()
         ([1.0, 0.0], [0.5, 0.0], [-1.0, 0.0], [2.0, 0.0])
 
     Args:
-        ratings: (..., K), a column per rater, in reward units. Without a mask NaN is a missing rating; inside a JAX
-            transformation, where NaN cannot be looked for, ratings without a mask are complete.
-        proxy: (...), the observed reward.
-        mask: (..., K), True where a rating exists; what is masked out may hold anything.
+        ratings: A column per rater, in reward units; stars and thumbs become floats. Without a mask NaN is a missing
+            rating; inside a JAX transformation, where NaN cannot be looked for, ratings without a mask are complete.
+        proxy: The observed reward.
+        mask: True where a rating exists; what is masked out may hold anything.
         ddof: Of the deviation; a visit with no more ratings than that has a deviation of 0.
 
     Returns:
@@ -39,29 +47,35 @@ def aggregate(ratings: Array, proxy: Array, mask: Array | None = None, ddof: int
     if ratings.ndim == 0 or ratings.shape[-1] == 0 or tuple(ratings.shape[:-1]) != tuple(proxy.shape):
         allowed = f"({', '.join([*map(str, proxy.shape), 'K'])}): one row per reward and one column per rater"
         raise _checks.InvalidValueError("ratings.shape", tuple(ratings.shape), allowed)
-    xp = namespace(ratings)
-    if not xp.isdtype(ratings.dtype, "real floating"):  # stars and thumbs
-        ratings = xp.astype(ratings, xp.asarray(0.0).dtype)
+    if getattr(ratings.dtype, "kind", "") != "f":  # neither NumPy's floats nor JAX's
+        xp = namespace(ratings)
+        if not xp.isdtype(ratings.dtype, "real floating"):
+            ratings = xp.astype(ratings, xp.asarray(0.0).dtype)
     if mask is not None:
         _checks.same_shape("mask", mask, "ratings", ratings)
-    if mask is None and not _checks.is_traced(ratings):
-        here = ratings == ratings
-        mask = None if bool(here.all()) else here
+    elif not _checks.is_traced(ratings):
+        finite = namespace(ratings).isfinite(ratings)
+        if not finite.all():
+            mask = ratings == ratings
     return _complete(ratings, proxy, ddof) if mask is None else _masked(ratings, proxy, mask, ddof)
 
 
-def _complete(ratings: Array, proxy: Array, ddof: int) -> Feedback:
-    xp = namespace(ratings)
-    _checks.finite("ratings", ratings)
-    raters = ratings.shape[-1]
-    mean, lowest = xp.mean(ratings, axis=-1), xp.min(ratings, axis=-1)
+def _complete(ratings: Float[Array, "*batch K"], proxy: Float[Array, "*batch"], ddof: int) -> Feedback:
+    xp, raters = namespace(ratings), ratings.shape[-1]
+    mean = ratings.sum(-1) / raters  # the method, not xp.sum, for speed: streams of one step live here
     one = xp.ones_like(mean)
-    sd = uncertainty.deviation(ratings, -1, ddof) if raters > max(ddof, 1) else 0.0 * one
+    if raters > max(ddof, 1):
+        gap = ratings - mean[..., None]
+        sd = uncertainty.root((gap * gap).sum(-1) / (raters - ddof))
+    else:
+        sd = 0.0 * one
     by_rater = ByRater(xp.ones_like(ratings), ratings, xp.zeros_like(ratings))
-    return Feedback(one, mean, lowest, sd, proxy, raters * one, by_rater)
+    return Feedback(one, mean, xp.min(ratings, axis=-1), sd, proxy, raters * one, by_rater)
 
 
-def _masked(ratings: Array, proxy: Array, mask: Array, ddof: int) -> Feedback:
+def _masked(
+    ratings: Float[Array, "*batch K"], proxy: Float[Array, "*batch"], mask: Bool[Array, "*batch K"], ddof: int
+) -> Feedback:
     xp = namespace(ratings)
     here = xp.astype(mask, ratings.dtype)
     held = xp.where(mask, ratings, xp.zeros_like(ratings))
@@ -83,81 +97,131 @@ def _masked(ratings: Array, proxy: Array, mask: Array, ddof: int) -> Feedback:
 _SUMMARY, _BY_RATER = slice(1, 5), 5
 
 
-def empty_rows(shape: tuple[int, ...], raters: int, xp: Any = np, dtype: Any = None) -> Array:
-    """Return rows (*shape, width) of state-actions that nobody has rated."""
+def empty_rows(shape: tuple[int, ...], raters: int, xp: Any = np, dtype: Any = None) -> Float[Array, "*batch width"]:
+    """Return rows (*shape, width) of state-actions that nobody has rated; see ``to_rows``.
+
+    Examples:
+        >>> from_rows(empty_rows((2,), raters=3)).count.tolist()
+        [0.0, 0.0]
+
+    Args:
+        shape: Of the state-actions.
+        raters: K, the columns of ``by_rater``.
+        xp: The array namespace: ``numpy``, ``jax.numpy`` or torch's.
+        dtype: Of the rows; the namespace's default if left out.
+    """
     return xp.zeros((*shape, _BY_RATER + 3 * raters), dtype=dtype)
 
 
-def to_rows(visit: Feedback) -> Array:
-    """Return feedback (...) as rows (..., width)."""
+def to_rows(visit: Feedback) -> Float[Array, "*batch width"]:
+    """Return feedback (...) as rows (..., 5 + 3 K), the form in which it is kept and merged.
+
+    Examples:
+        >>> visit = aggregate(np.array([[1.0, 3.0]]), np.array([2.0]))
+        >>> to_rows(visit)[0, :5].tolist()  # count, mean, lowest, sd, proxy
+        [1.0, 2.0, 1.0, 1.0, 2.0]
+    """
     assert visit.by_rater is not None
-    xp = namespace(visit.mean)
-    summary = xp.stack([visit.count, visit.mean, visit.lowest, visit.sd, visit.proxy], axis=-1)
-    return xp.concat([summary, *visit.by_rater], axis=-1)
+    summary = (visit.count, visit.mean, visit.lowest, visit.sd, visit.proxy)
+    return namespace(visit.mean).concat([*(x[..., None] for x in summary), *visit.by_rater], axis=-1)
 
 
-def from_rows(rows: Array) -> Feedback:
-    """Return rows (..., width) as feedback (...)."""
+def from_rows(rows: Float[Array, "*batch width"]) -> Feedback:
+    """Return rows (..., 5 + 3 K) as feedback (...); see ``to_rows``.
+
+    Examples:
+        >>> visit = aggregate(np.array([[1.0, 3.0]]), np.array([2.0]))
+        >>> from_rows(to_rows(visit)).raters.tolist()
+        [2.0]
+    """
+    counts, means, squares = _columns(rows)
+    by_rater = ByRater(rows[..., counts], rows[..., means], rows[..., squares])
+    raters = (by_rater.count > 0).sum(-1, dtype=rows.dtype)
+    return Feedback(rows[..., 0], rows[..., 1], rows[..., 2], rows[..., 3], rows[..., 4], raters, by_rater)
+
+
+def _columns(rows: Float[Array, "*batch width"]) -> tuple[slice, slice, slice]:
+    """Return where the raters' counts, means and squares are."""
     k = (rows.shape[-1] - _BY_RATER) // 3
-    by_rater = ByRater(*(rows[..., _BY_RATER + i * k : _BY_RATER + (i + 1) * k] for i in range(3)))
-    heard = namespace(rows).astype(by_rater.count > 0, rows.dtype)
-    summary = (rows[..., i] for i in range(_BY_RATER))
-    return Feedback(*summary, namespace(rows).sum(heard, axis=-1), by_rater)
+    first, second = _BY_RATER + k, _BY_RATER + 2 * k
+    return slice(_BY_RATER, first), slice(first, second), slice(second, None)
 
 
-def merged(rows: Array, visit: Array, rated: Array) -> Array:
-    """Return rows (..., width) after one more visit; unchanged where ``rated`` (...) is 0 and not 1.
+def merged(
+    rows: Float[Array, "*batch width"], visit: Float[Array, "*batch width"], rated: Float[Array, "*batch"]
+) -> Float[Array, "*batch width"]:
+    """Return rows after one more visit; unchanged where ``rated`` is 0 and not 1.
 
     The visit's mean, lowest, deviation and observed reward enter running means; each rater's rating enters that
     rater's count, mean and squared deviations [Welford 1962].
+
+    Examples:
+        >>> first, second = (to_rows(aggregate(np.array([[x]]), np.array([0.0]))) for x in (1.0, 3.0))
+        >>> from_rows(merged(first, second, np.ones(1))).mean.tolist()
+        [2.0]
+
+    Args:
+        rows: What is known so far, see ``to_rows``.
+        visit: The visit, alike.
+        rated: Whether somebody rated it.
     """
     xp = namespace(rows, visit)
-    raters = (rows.shape[-1] - _BY_RATER) // 3
     count = rows[..., 0] + rated
     share = rated / xp.maximum(count, xp.ones_like(count))
-    summary = rows[..., _SUMMARY] + share[..., None] * (visit[..., _SUMMARY] - rows[..., _SUMMARY])
-    counts, means, squares = (slice(_BY_RATER + i * raters, _BY_RATER + (i + 1) * raters) for i in range(3))
+    before = rows[..., _SUMMARY]
+    summary = before + share[..., None] * (visit[..., _SUMMARY] - before)
+    counts, means, squares = _columns(rows)
+    before, rating = rows[..., means], visit[..., means]
     new = visit[..., counts] * rated[..., None]
     each = rows[..., counts] + new
-    gap = visit[..., means] - rows[..., means]
-    mean = rows[..., means] + new / xp.maximum(each, xp.ones_like(each)) * gap
-    square = rows[..., squares] + new * gap * (visit[..., means] - mean)
+    gap = rating - before
+    mean = before + new / xp.maximum(each, xp.ones_like(each)) * gap
+    square = rows[..., squares] + new * gap * (rating - mean)
     return xp.concat([count[..., None], summary, each, mean, square], axis=-1)
 
 
 def nothing(shape: tuple[int, ...], raters: int, xp: Any = np, dtype: Any = None) -> Feedback:
     """Return the feedback of state-actions that nobody has rated: arrays of that shape, all 0.
 
+    Examples:
+        >>> nothing((2,), raters=3).raters.tolist()
+        [0.0, 0.0]
+
     Args:
         shape: Of the state-actions.
-        raters: Columns of ``by_rater``.
+        raters: K, the columns of ``by_rater``.
         xp: The array namespace: ``numpy``, ``jax.numpy`` or torch's.
         dtype: Of the arrays; the namespace's default if left out.
     """
-    of_all = (xp.zeros(shape, dtype=dtype) for _ in range(6))
-    return Feedback(*of_all, ByRater(*(xp.zeros((*shape, raters), dtype=dtype) for _ in range(3))))
+    by_rater = ByRater._make(xp.zeros((*shape, raters), dtype=dtype) for _ in range(3))
+    return Feedback._make([*(xp.zeros(shape, dtype=dtype) for _ in range(6)), by_rater])
 
 
-def by_item(visits: Feedback, item: np.ndarray) -> Feedback:
+def by_item(visits: Feedback, item: Integer[np.ndarray, " n"]) -> Feedback:
     """Return what is known of every item after all visits to it, (M,) arrays (NumPy).
+
+    Examples:
+        >>> visits = aggregate(np.array([[1.0], [3.0], [5.0]]), np.zeros(3))
+        >>> by_item(visits, np.array([0, 0, 1])).mean.tolist()
+        [2.0, 5.0]
 
     Args:
         visits: (n,) arrays, as ``aggregate`` gives them.
-        item: (n,), numbers of the visited items in 0..M-1.
+        item: The number of each visit's item, in 0..M-1.
     """
     assert visits.by_rater is not None
     size, raters = int(item.max(initial=-1)) + 1, visits.by_rater.count.shape[-1]
-    count = np.bincount(item, visits.count, size)
-    share = np.maximum(count, 1.0)
 
-    def mean(column: np.ndarray) -> np.ndarray:
-        return np.bincount(item, column * visits.count, size) / share
+    def total(column: Float[np.ndarray, " n"]) -> Float[np.ndarray, " M"]:
+        return np.bincount(item, column, size).astype(float)  # of nothing it counts in whole numbers
 
-    each = ByRater(*(np.zeros((size, raters)) for _ in range(3)))
+    count = total(visits.count)
+    each = ByRater._make(np.zeros((size, raters)) for _ in range(3))
     for k in range(raters):
-        here, rating = (x[:, k] for x in visits.by_rater[:2])
-        each.count[:, k] = np.bincount(item, here, size)
-        each.mean[:, k] = np.bincount(item, here * rating, size) / np.maximum(each.count[:, k], 1.0)
-        each.m2[:, k] = np.bincount(item, here * (rating - each.mean[item, k]) ** 2, size)
-    columns = (mean(x) for x in (visits.mean, visits.lowest, visits.sd, visits.proxy))
-    return Feedback(count, *columns, (each.count > 0).sum(-1).astype(float), each)
+        here, rating = visits.by_rater.count[:, k], visits.by_rater.mean[:, k]
+        each.count[:, k] = total(here)
+        each.mean[:, k] = total(here * rating) / np.maximum(each.count[:, k], 1.0)
+        each.m2[:, k] = total(here * (rating - each.mean[item, k]) ** 2)
+    of_all = (visits.mean, visits.lowest, visits.sd, visits.proxy)
+    columns = [total(x * visits.count) / np.maximum(count, 1.0) for x in of_all]
+    return Feedback._make([count, *columns, (each.count > 0).sum(-1).astype(float), each])

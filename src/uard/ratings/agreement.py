@@ -16,11 +16,18 @@ def krippendorff_alpha(ratings: object) -> float | None:
     alpha = 1 - (n - 1) / n sum_u m_u S_u / (m_u - 1) / S, with m_u ratings of sum of squares S_u in row u, and n
     ratings of sum of squares S in all rows with at least two.
 
+    Examples:
+        >>> krippendorff_alpha([[1.0, 1.0], [2.0, 2.0]]), krippendorff_alpha([[1.0, 2.0], [2.0, 1.0]])
+        (1.0, -0.5)
+
     Args:
-        ratings: (n, K), a column per annotator, NaN where a rating is missing.
+        ratings: (n, K), a column per annotator, NaN where a rating is missing; an array or rows of numbers.
 
     Returns:
-        None where no row has two ratings, or all ratings are equal.
+        A number <= 1; None where no row has two ratings, or all ratings are equal.
+
+    Raises:
+        InvalidValueError: for another shape, or a rating that is infinite or no number.
     """
     x = _checks.as_numpy("ratings", ratings)
     if x.ndim != 2:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from uard import _checks
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Shaped
 
 NUMBERS = ("sigma_m", "true_reward")
 LABELS = ("item", "episode", "step")
@@ -15,32 +18,41 @@ LABELS = ("item", "episode", "step")
 
 @dataclass(frozen=True, eq=False)
 class RatingLog:
-    """Rewards and what people said of them, one row per step.
+    """Rewards and people's ratings of them, one row per step.
+
+    Examples:
+        >>> log = RatingLog(np.array([0.0, 4.0]), np.array([[0.1, 0.0], [-1.0, 2.0]]), episode=np.array(["a", "a"]))
+        >>> len(log), log.raters, log.place(1)
+        (2, ('rating_1', 'rating_2'), 'row 2 (episode a)')
 
     Attributes:
-        reward: Observed rewards, (n,) with n >= 1; NaN where one is missing.
-        ratings: Ratings in the reward's unit, (n, K); NaN where one is missing. K = 0 if nobody rates.
+        reward: Observed rewards, n >= 1; NaN where one is missing.
+        ratings: Ratings in the reward's unit; NaN where one is missing. K = 0 if nobody rates.
         raters: Names of the K annotators; ``rating_1`` and so on if left out.
-        sigma_m: Ensemble disagreement, (n,), >= 0, or None.
-        true_reward: What each step was really worth, (n,), or None.
-        item: What was rated, (n,), or None where every row is another thing.
-        episode: Name of each row's episode, (n,), or None.
-        step: Name of each row's step, (n,), or None.
+        sigma_m: Ensemble disagreement in the reward's unit, >= 0, or None.
+        true_reward: What each step was really worth, or None.
+        item: What was rated, or None where every row is another thing.
+        episode: Name of each row's episode, or None.
+        step: Name of each row's step, or None.
         source: Where the log is from.
     """
 
-    reward: np.ndarray
-    ratings: np.ndarray
+    reward: Float[np.ndarray, " n"]
+    ratings: Float[np.ndarray, "n K"]
     raters: tuple[str, ...] = ()
-    sigma_m: np.ndarray | None = None
-    true_reward: np.ndarray | None = None
-    item: np.ndarray | None = None
-    episode: np.ndarray | None = None
-    step: np.ndarray | None = None
+    sigma_m: Float[np.ndarray, " n"] | None = None
+    true_reward: Float[np.ndarray, " n"] | None = None
+    item: Shaped[np.ndarray, " n"] | None = None
+    episode: Shaped[np.ndarray, " n"] | None = None
+    step: Shaped[np.ndarray, " n"] | None = None
     source: str = "log"
 
     def __post_init__(self) -> None:
-        """Check shapes, and that no sigma_m is negative."""
+        """Check shapes, and that no sigma_m is negative.
+
+        Raises:
+            InvalidValueError: naming the column, its shape or the row, and what is allowed.
+        """
         reward = _checks.as_numpy("reward", self.reward)
         ratings = _checks.as_numpy("ratings", self.ratings)
         if reward.ndim != 1 or not reward.size:
@@ -74,5 +86,17 @@ class RatingLog:
 
 
 def bad_cell(source: str, row: int, column: str, value: object, allowed: str) -> _checks.InvalidValueError:
-    """Return the error of a cell; ``row`` is counted from 0."""
+    """Return the error of a cell that holds no number.
+
+    Examples:
+        >>> str(bad_cell("log.csv", 6, "reward", "high", allowed="a number"))
+        "log.csv: row 7, column 'reward' = 'high': must be a number"
+
+    Args:
+        source: What the log is called.
+        row: Counted from 0.
+        column: Name of the column.
+        value: What the cell holds.
+        allowed: What it may hold.
+    """
     return _checks.InvalidValueError(f"{source}: row {row + 1}, column {column!r}", value, allowed)

@@ -1,94 +1,134 @@
-"""What a stream keeps of ratings: a table of state-actions that come again, or a uniform sample of steps that do not."""
+"""What a stream keeps of ratings: a table of state-actions that come again, or a sample of steps that do not."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uard.method.feedback import ByRater, Feedback
-from uard.ratings.aggregate import aggregate, empty_rows, from_rows, merged, to_rows
+from uard.ratings.aggregate import empty_rows, from_rows, merged, to_rows
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Integer
 
 
-class FeedbackTable:
-    """Feedback of state-actions by number. Changed in place; grows in rows and in raters."""
+class _Rows:
+    """Feedback by number, as rows (see ``uard.ratings.aggregate.to_rows``); grows in rows and in raters.
+
+    Attributes:
+        values: The rows, some of them not used yet. A column's numbers are neighbours in memory, because statistics
+            are taken over columns.
+        filled: How many are used.
+        raters: K, for which there are columns.
+    """
 
     def __init__(self) -> None:
-        """Start with no state-action."""
-        self._rows, self._raters, self._filled = empty_rows((0,), 1), 1, 0
+        self.values: Float[np.ndarray, "n width"] = np.asfortranarray(empty_rows((0,), 1))
+        self.filled, self.raters = 0, 1
 
-    def observe(self, slots: np.ndarray, visit: Feedback, size: int) -> None:
-        """Take in visits, one after the other.
+    def feedback(self) -> Feedback:
+        """Return all of it, (n,) arrays."""
+        return from_rows(self.values[: self.filled])
 
-        Args:
-            slots: (B,), numbers of the visited state-actions; one may come several times.
-            visit: (B,) arrays, as ``aggregate`` gives them.
-            size: State-actions so far: all numbers are below it.
-        """
-        assert visit.by_rater is not None
-        self._grow(size, max(visit.by_rater.count.shape[1], self._raters))
-        new, left = to_rows(_widened(visit, self._raters)), np.flatnonzero(visit.count)
-        while left.size:  # a state-action that was visited twice takes two rounds
-            now = left if left.size == 1 else left[np.sort(np.unique(slots[left], return_index=True)[1])]
-            self._rows[slots[now]] = merged(self._rows[slots[now]], new[now], visit.count[now])
-            left = np.setdiff1d(left, now) if now.size < left.size else left[:0]
-
-    def __getitem__(self, slots: np.ndarray) -> Feedback:
-        """Return what is known of some state-actions, (B,) arrays."""
-        return from_rows(self._rows[slots])
-
-    def every(self) -> Feedback:
-        """Return what is known of all state-actions so far."""
-        return from_rows(self._rows[: self._filled])
-
-    def _grow(self, size: int, raters: int) -> None:
-        self._filled = max(self._filled, size)
-        if raters > self._raters:
-            self._rows = to_rows(_widened(from_rows(self._rows), raters))
-            self._raters = raters
-        room = len(self._rows)
+    def grow(self, size: int) -> None:
+        """Make room for so many rows."""
+        self.filled = max(self.filled, size)
+        room = len(self.values)
         if size > room:
-            extra = empty_rows((max(size, 2 * room, 64) - room,), raters)
-            self._rows = np.concatenate([self._rows, extra])
+            more = np.zeros((max(size, 2 * room, 64) - room, self.values.shape[1]), order="F")
+            self.values = np.concatenate([self.values, more])
+
+    def fitted(self, visit: Feedback) -> Float[np.ndarray, "B width"]:
+        """Return a visit as rows of this width; raters who have not been met before get columns."""
+        assert visit.by_rater is not None
+        raters = visit.by_rater.count.shape[1]
+        if raters > self.raters:
+            self.values = np.asfortranarray(to_rows(_widened(from_rows(self.values), raters)))
+            self.raters = raters
+        return to_rows(visit if raters == self.raters else _widened(visit, self.raters))
 
 
 def _widened(feedback: Feedback, raters: int) -> Feedback:
-    """Return feedback (B,) with columns for more raters, who have said nothing."""
+    """Return feedback (B,) with columns for more raters, who have rated nothing."""
     each = feedback.by_rater
     assert each is not None
-    more = raters - each.count.shape[1]
-    return feedback._replace(by_rater=ByRater(*(np.pad(x, ((0, 0), (0, more))) for x in each))) if more else feedback
+    more = ((0, 0), (0, raters - each.count.shape[1]))
+    return feedback._replace(by_rater=ByRater._make(np.pad(x, more) for x in each))
+
+
+class FeedbackTable:
+    """Feedback of state-actions by number. Changed in place; grows in rows and in raters.
+
+    Examples:
+        >>> from uard.ratings.aggregate import aggregate
+        >>> table = FeedbackTable()
+        >>> table.observe(np.array([0, 0]), aggregate(np.array([[1.0], [3.0]]), np.zeros(2)), size=1)
+        >>> table[np.array([0])].mean.tolist()
+        [2.0]
+    """
+
+    def __init__(self) -> None:
+        """Start with no state-action."""
+        self._rows = _Rows()
+
+    def observe(self, slots: Integer[np.ndarray, " B"], visit: Feedback, size: int) -> None:
+        """Take in visits, one after the other.
+
+        Args:
+            slots: Numbers of the visited state-actions; one may come several times.
+            visit: (B,) arrays, as ``aggregate`` gives them.
+            size: State-actions so far: all numbers are below it.
+        """
+        rows = self._rows
+        rows.grow(size)
+        new, left = rows.fitted(visit), visit.count.nonzero()[0]
+        while left.size:  # a state-action that was visited twice takes two rounds
+            places, now = slots[left], left
+            if len(set(places.tolist())) < left.size:
+                now = left[np.sort(np.unique(places, return_index=True)[1])]
+                places = slots[now]
+            rows.values[places] = merged(rows.values[places], new[now], visit.count[now])
+            left = np.setdiff1d(left, now) if now.size < left.size else left[:0]
+
+    def __getitem__(self, slots: Integer[np.ndarray, " B"]) -> Feedback:
+        """Return what is known of some state-actions, (B,) arrays."""
+        return from_rows(self._rows.values[slots])
+
+    def every(self) -> Feedback:
+        """Return what is known of all state-actions so far."""
+        return self._rows.feedback()
 
 
 class RatingSample:
-    """A uniform sample of rated steps [Vitter 1985, algorithm R]. Changed in place."""
+    """A uniform sample of rated steps [Vitter 1985, algorithm R]. Changed in place.
+
+    Examples:
+        >>> from uard.ratings.aggregate import aggregate
+        >>> sample = RatingSample(capacity=2, seed=0)
+        >>> sample.put(aggregate(np.ones((9, 1)), np.zeros(9)))
+        >>> sample.feedback().mean.tolist()
+        [1.0, 1.0]
+    """
 
     def __init__(self, capacity: int, seed: int):
         """Start with none; ``capacity`` is how many are kept."""
         self._capacity, self._random = capacity, np.random.default_rng(seed)
-        self._ratings, self._proxy = np.zeros((0, 1)), np.zeros(0)
-        self._filled, self._seen = 0, 0
+        self._rows, self._seen = _Rows(), 0
 
-    def put(self, ratings: np.ndarray, proxy: np.ndarray) -> None:
-        """Show it rated steps: ratings (B, K) with NaN where one is missing, observed rewards (B,)."""
-        free = min(len(proxy), self._capacity - self._filled)
-        self._grow(self._filled + free, ratings.shape[1])
-        places = np.arange(self._filled, self._filled + len(proxy))
-        if free < len(proxy):
-            places[free:] = self._random.integers(0, self._seen + np.arange(free, len(proxy)) + 1)
-        for i in np.flatnonzero(places < self._capacity):  # in order: a later one may take an earlier one's place
-            self._ratings[places[i]] = np.nan
-            self._ratings[places[i], : ratings.shape[1]] = ratings[i]
-            self._proxy[places[i]] = proxy[i]
-        self._filled += free
-        self._seen += len(proxy)
+    def put(self, visit: Feedback) -> None:
+        """Show it rated steps, (B,) arrays as ``aggregate`` gives them."""
+        rows, size = self._rows, len(visit.count)
+        places = np.arange(rows.filled, rows.filled + size)
+        free = min(size, self._capacity - rows.filled)
+        if free < size:
+            places[free:] = self._random.integers(0, self._seen + np.arange(free, size) + 1)
+        rows.grow(rows.filled + free)
+        kept = places < self._capacity
+        new = rows.fitted(visit)  # before the table is written to: it may get columns
+        rows.values[places[kept]] = new[kept]  # where two take one place, NumPy leaves the later
+        self._seen += size
 
-    def feedback(self, ddof: int) -> Feedback:
-        """Return what was said of the steps that were kept, (n,) arrays."""
-        return aggregate(self._ratings[: self._filled], self._proxy[: self._filled], ddof=ddof)
-
-    def _grow(self, rows: int, raters: int) -> None:
-        have, columns = self._ratings.shape
-        more = max(rows, 2 * have, 64) - have if rows > have else 0
-        if more or raters > columns:
-            width = ((0, more), (0, max(0, raters - columns)))
-            self._ratings = np.pad(self._ratings, width, constant_values=np.nan)
-            self._proxy = np.pad(self._proxy, width[0])
+    def feedback(self) -> Feedback:
+        """Return what is known of the steps that were kept, (n,) arrays."""
+        return self._rows.feedback()

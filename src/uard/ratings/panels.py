@@ -1,11 +1,11 @@
-"""Panels of raters: what each of K people says of a step.
+"""Panels of raters: how each of K people rates a step.
 
 A simulated rater sees the observed reward (the proxy), the true reward and whether the step is *contested* (one that
 pays for something else than what was meant, such as entering a trap), and answers with a number. In a legitimate twin
 the two rewards agree, but the contested steps stay contested. A panel reads the truth, as people do; the learner gets
 nothing but the ratings.
 
-What a panel says of a step is a law, and an answer is drawn from it:
+How a panel rates a step is a law, and an answer is drawn from it:
 
     >>> import numpy as np
     >>> law = PANELS["main"].law(np.array(4.0), np.array(-1.0), np.array(True))
@@ -18,19 +18,27 @@ What a panel says of a step is a law, and an answer is drawn from it:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from uard import _checks
-from uard.method.arrays import Array, namespace
+from uard.method.arrays import Array, Numbers, namespace
 
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+A_PANEL = "a tuple of one Rater or more"
 UNIFORMS = 3  # uniform numbers that an answer needs of a rater who lapses, skips steps or counts in stars
 
 
 @dataclass(frozen=True)
 class Rater:
     """How one simulated rater answers: scale (true + temptation (proxy - true)) + bias + noise.
+
+    Examples:
+        >>> Rater(temptation=0.5, bias=1.0).centre(proxy=4.0, true=-1.0)
+        2.5
 
     Attributes:
         temptation: How far the rater is drawn from the truth towards the proxy, in [0, 1]; 1 repeats the proxy.
@@ -75,40 +83,57 @@ class Rater:
         """Whether every answer is normal: no lapses, nothing skipped, no stars."""
         return self.lapse == 0 and self.coverage == 1 and self.stars is None
 
-    def centre(self, proxy: Array, true: Array) -> Array:
-        """Return the rater's mean answer."""
+    def centre(self, proxy: Numbers, true: Numbers) -> Array:
+        """Return the rater's mean answer to steps of which proxy and true reward are given; in reward units."""
         # A rater who repeats the proxy repeats it to the bit.
         seen = proxy if self.temptation == 1 else true + self.temptation * (proxy - true)
         return seen if self.scale == 1 and self.bias == 0 else self.scale * seen + self.bias
 
 
 class Quirks(NamedTuple):
-    """What makes answers other than normal: (K,) chance of a lapse, coverage, width of a star (0: none); the range."""
+    """What makes the answers of K raters other than normal.
 
-    lapse: Array
-    coverage: Array
-    step: Array
-    low: Array
-    high: Array
+    Attributes:
+        lapse: Chance of a lapse.
+        coverage: Share of the steps that are answered.
+        step: Width of a star, in reward units; 0 for a rater who does not count in stars.
+        low: Lower end of the range of answers, in reward units.
+        high: Upper end.
+    """
+
+    lapse: Float[Array, " K"]
+    coverage: Float[Array, " K"]
+    step: Float[Array, " K"]
+    low: Float[Array, ""]
+    high: Float[Array, ""]
 
 
 class RatingLaw(NamedTuple):
-    """How a panel answers: rating k is normal with (..., K) ``centre`` and ``deviation``, but for its quirks.
+    """How a panel of K raters answers: rating k is normal, but for its quirks.
 
     Attributes:
-        centre: In reward units.
-        deviation: In reward units, >= 0.
-        reach: (...), 1 where the panel can rate, 0 where nobody ever does; None if it reaches every step.
+        centre: Mean of each rater's answers, in reward units.
+        deviation: Standard deviation of each rater's answers, in reward units, >= 0; broadcasts to ``centre``.
+        reach: 1 where the panel can rate, 0 where nobody ever does; None if it reaches every step.
         quirks: See ``Quirks``; None where all raters are plain.
     """
 
-    centre: Array
-    deviation: Array
-    reach: Array | None = None
+    centre: Float[Array, "*batch K"]
+    deviation: Float[Array, "*#batch K"]
+    reach: Float[Array, "*batch"] | None = None
     quirks: Quirks | None = None
 
-    def at(self, *place: Array) -> RatingLaw:
-        """Return the law of one state-action, or of several."""
+    def at(self, *place: Any) -> RatingLaw:
+        """Return the law of one state-action, or of several.
+
+        Examples:
+            >>> law = PANELS["single"].law(np.array([4.0, 0.0]), np.array([-1.0, 0.0]), np.array([True, False]))
+            >>> law.at(0).centre.tolist()
+            [-1.0]
+
+        Args:
+            place: One index per axis of the batch, a number or an array.
+        """
         reach = None if self.reach is None else self.reach[place]
         return self._replace(centre=self.centre[place], deviation=self.deviation[place], reach=reach)
 
@@ -116,6 +141,12 @@ class RatingLaw(NamedTuple):
 @dataclass(frozen=True)
 class Panel:
     """Several raters, who are asked together.
+
+    Examples:
+        >>> panel = Panel((Rater(), Rater(noise=1.0, stars=5)), low=-2.0, high=2.0)
+        >>> law = panel.law(proxy=np.array(1.0), true=np.array(1.0), contested=np.array(False))
+        >>> draw(law, np.random.default_rng(0)).shape
+        (2,)
 
     Attributes:
         raters: At least one.
@@ -134,11 +165,10 @@ class Panel:
             InvalidValueError: nobody rates, something that is no ``Rater``, or a rater who lapses or counts in stars
                 without a range.
         """
-        if not isinstance(self.raters, tuple) or not self.raters:
-            raise _checks.InvalidValueError("raters", self.raters, "a tuple of one Rater or more")
+        if not _checks.instance("raters", self.raters, tuple, A_PANEL):
+            raise _checks.InvalidValueError("raters", self.raters, A_PANEL)
         for k, rater in enumerate(self.raters):
-            if not isinstance(rater, Rater):
-                raise _checks.InvalidValueError(f"raters[{k}]", rater, "a Rater")
+            _checks.instance(f"raters[{k}]", rater, Rater, "a Rater")
         if self.low is None or self.high is None:
             if any(rater.lapse > 0 or rater.stars is not None for rater in self.raters):
                 allowed = "given with high: raters who lapse or count in stars answer within a range"
@@ -147,11 +177,17 @@ class Panel:
             _checks.number("low", self.low)
             _checks.number("high", self.high, low=self.low, open_low=True)
 
-    def law(self, proxy: Array, true: Array, contested: Array, noise: Array = 0.0) -> RatingLaw:
+    def law(
+        self,
+        proxy: Float[Array, "*batch"],
+        true: Float[Array, "*batch"],
+        contested: Bool[Array, "*batch"],
+        noise: Numbers = 0.0,
+    ) -> RatingLaw:
         """Return how the panel answers about steps of any shape; nothing is checked.
 
         Args:
-            proxy: Observed reward, an array of floats (one of no dimensions for one step).
+            proxy: Observed reward (an array of no dimensions for one step).
             true: True reward.
             contested: Whether the step is contested.
             noise: Standard deviation of extra normal noise of every rater, in reward units, >= 0.
@@ -166,25 +202,33 @@ class Panel:
             return None
         low, high = self.low or 0.0, self.high or 0.0
         width = [0.0 if r.stars is None else (high - low) / (r.stars - 1) for r in self.raters]
-        columns = [r.lapse for r in self.raters], [r.coverage for r in self.raters], width
-        lapse, coverage, step = (np.array(c, np.float32) for c in columns)
-        return Quirks(lapse, coverage, step, np.float32(low), np.float32(high))
+        lapse, coverage = [r.lapse for r in self.raters], [r.coverage for r in self.raters]
+        return Quirks._make(np.array(x, np.float32) for x in (lapse, coverage, width, low, high))
 
 
-def _noise(rater: Rater, proxy: Array, contested: Array, xp: Any) -> Array:
+def _noise(
+    rater: Rater, proxy: Float[Array, "*batch"], contested: Bool[Array, "*batch"], xp: Any
+) -> Float[Array, "*batch"]:
     everywhere = xp.full_like(proxy, rater.noise)
     if rater.contested_noise is None:
         return everywhere
     return xp.where(contested, xp.full_like(proxy, rater.contested_noise), everywhere)
 
 
-def answers(law: RatingLaw, normal: Array, uniform: Array | None = None) -> tuple[Array, Array | None]:
-    """Return one rating of every rater (..., K), and which of them exist (None: all do).
+def answers(
+    law: RatingLaw, normal: Float[Array, "*batch K"], uniform: Float[Array, "*batch K 3"] | None = None
+) -> tuple[Float[Array, "*batch K"], Bool[Array, "*batch K"] | None]:
+    """Return one rating of every rater, and which of them exist (None: all do).
+
+    Examples:
+        >>> law = PANELS["main"].law(np.array(4.0), np.array(-1.0), np.array(True))
+        >>> answers(law, np.ones(3))[0].tolist()
+        [-0.9, 2.0, 2.0]
 
     Args:
         law: How they answer.
-        normal: (..., K) standard normal numbers.
-        uniform: (..., K, ``UNIFORMS``) numbers in [0, 1); needed only if the law has quirks.
+        normal: Standard normal numbers.
+        uniform: Numbers in [0, 1), ``UNIFORMS`` = 3 for each answer; needed only if the law has quirks.
     """
     ratings = law.centre + law.deviation * normal
     if law.quirks is None:
@@ -197,10 +241,17 @@ def answers(law: RatingLaw, normal: Array, uniform: Array | None = None) -> tupl
     return xp.where(q.step > 0, starred, ratings), uniform[..., 2] < q.coverage
 
 
-def draw(law: RatingLaw, random: np.random.Generator) -> np.ndarray:
-    """Return one rating of every rater (..., K) as NumPy numbers, NaN where a rater did not or cannot answer."""
-    normal = random.standard_normal(law.centre.shape)
-    uniform = None if law.quirks is None else random.random((*law.centre.shape, UNIFORMS))
+def draw(law: RatingLaw, random: np.random.Generator) -> Float[np.ndarray, "*batch K"]:
+    """Return one rating of every rater as NumPy numbers, NaN where a rater did not or cannot answer.
+
+    Examples:
+        >>> law = PANELS["colluding"].law(np.array([4.0, 0.0]), np.array([-1.0, 0.0]), np.array([True, False]))
+        >>> draw(law, np.random.default_rng(0)).tolist()
+        [[4.0, 4.0, 4.0], [0.0, 0.0, 0.0]]
+    """
+    shape: tuple[int, ...] = law.centre.shape
+    normal = random.standard_normal(shape)
+    uniform = None if law.quirks is None else random.random((*shape, UNIFORMS))
     ratings, mask = answers(law, normal, uniform)
     ratings = ratings if mask is None else np.where(mask, ratings, np.nan)
     return ratings if law.reach is None else np.where(np.asarray(law.reach)[..., None] > 0, ratings, np.nan)
@@ -210,21 +261,23 @@ def draw(law: RatingLaw, random: np.random.Generator) -> np.ndarray:
 # tempted rater stands 60 % of the way from truth to proxy, the erratic one varies (sd 1) about 40 %; with -1 and +4
 # that is 2 and 1. Elsewhere all three tell the truth with sd 0.1.
 MAIN = Panel((Rater(), Rater(temptation=0.6, contested_noise=0.0), Rater(temptation=0.4, contested_noise=1.0)))
+"""One truthful, one tempted, one erratic on contested steps (section 5.8 of the paper)."""
 APPENDIX = Panel((Rater(), Rater(noise=0.3), Rater(noise=0.2, contested_noise=1.0)))
+"""Three truthful ones with noise of sd 0.1, 0.3 and 0.2, the last 1.0 on contested steps (the paper's appendix)."""
 COLLUDING = Panel((Rater(temptation=1.0, noise=0.0),) * 3)
+"""Three who all repeat the proxy: no method that relies on them can help, a control that must fail."""
 SINGLE = Panel((Rater(),))
+"""One truthful rater with sd 0.1, who alone never disagrees with itself."""
 
 PANELS: dict[str, Panel] = {"main": MAIN, "appendix": APPENDIX, "colluding": COLLUDING, "single": SINGLE}
-DESCRIPTIONS: dict[str, str] = {
-    "main": "One truthful, one tempted, one erratic on contested steps (section 5.8 of the paper).",
-    "appendix": "Three truthful ones with noise of sd 0.1, 0.3 and 0.2, the last 1.0 where contested (its appendix).",
-    "colluding": "Three who all repeat the proxy: no method that listens to them can help, a control that must fail.",
-    "single": "One truthful rater with sd 0.1, who alone never disagrees with itself.",
-}
 
 
 def as_panel(panel: str | Panel) -> Panel:
     """Return the panel of a name, or the panel itself.
+
+    Examples:
+        >>> as_panel("single") is SINGLE and as_panel(SINGLE) is SINGLE
+        True
 
     Raises:
         UnknownNameError: with the nearest name.
@@ -233,5 +286,10 @@ def as_panel(panel: str | Panel) -> Panel:
 
 
 def name_of(panel: Panel) -> str:
-    """Return a panel's name if it has one, else what it is."""
+    """Return a panel's name if it has one, else what it is.
+
+    Examples:
+        >>> name_of(MAIN)
+        'main'
+    """
     return next((name for name, other in PANELS.items() if other == panel), str(panel))

@@ -11,21 +11,41 @@ from uard.ratings.log import LABELS, RatingLog, bad_cell
 
 
 def rollout(env: Any, steps: int = 1000, seed: int = 0) -> RatingLog:
-    """Take random actions in a Gymnasium environment and log what it pays and what is said of it.
+    """Take random actions in a Gymnasium environment and log its rewards and their ratings.
 
     Read from ``info``: ``ratings``, K numbers; ``sigma_m``; and ``evaluation.true_reward`` as the environments of this
     package give it. Where states and actions are whole numbers a row's item is its state-action.
 
+    Examples:
+        >>> import gymnasium, uard.envs
+        >>> log = rollout(gymnasium.make("uard/TrapGrid6-v0", panel="main"), steps=20)
+        >>> log.ratings.shape, log.source
+        ((20, 3), 'uard/TrapGrid6-v0, 20 random steps, seed 0')
+
     Args:
         env: A ``gymnasium.Env``; it is not closed.
         steps: Number of steps, >= 1.
-        seed: Seed of the environment and of the actions.
+        seed: Seed of the environment and of the actions, >= 0.
 
     Raises:
         InvalidValueError: the number of ratings or what ``info`` holds changes from one step to another.
     """
     _checks.whole("steps", steps, low=1)
     _checks.whole("seed", seed, low=0)
+    columns = _drop_absent(_random_steps(env, steps, seed))
+    widths = [np.shape(v) for v in columns.get("ratings", ())]
+    for row, width in enumerate(widths):
+        if len(width) != 1 or width != widths[0]:
+            raise bad_cell("rollout", row, "ratings", columns["ratings"][row], "a row of K ratings, as in the first")
+    name = "rollout" if env.spec is None else env.spec.id
+    source = f"{name}, {steps} random steps, seed {seed}"
+    arrays: dict[str, Any] = {"ratings": np.zeros((steps, 0))}
+    arrays |= {name: np.asarray(column) for name, column in columns.items()}
+    return RatingLog(**arrays, source=source)
+
+
+def _random_steps(env: Any, steps: int, seed: int) -> dict[str, list[Any]]:
+    """Return the columns of a log; None where ``info`` holds nothing."""
     env.action_space.seed(seed)
     columns: dict[str, list[Any]] = {n: [] for n in ("reward", "ratings", "sigma_m", "true_reward", *LABELS)}
     state, _ = env.reset(seed=seed)
@@ -43,18 +63,14 @@ def rollout(env: Any, steps: int = 1000, seed: int = 0) -> RatingLog:
         if terminated or truncated:
             state, _ = env.reset()
             episode, step = episode + 1, 0
-    for name in ("ratings", "sigma_m", "true_reward", "item"):
-        absent = [v is None for v in columns[name]]
-        if any(absent):
-            if not all(absent):
-                row = absent.index(not absent[0])
-                raise bad_cell("rollout", row, name, columns[name][row], "in info at every step, or at none")
-            del columns[name]
-    widths = [np.shape(v) for v in columns.get("ratings", ())]
-    for row, width in enumerate(widths):
-        if len(width) != 1 or width != widths[0]:
-            raise bad_cell("rollout", row, "ratings", columns["ratings"][row], "a row of K ratings, as in the first")
-    ratings = columns.pop("ratings", np.zeros((steps, 0)))
-    name = "rollout" if env.spec is None else env.spec.id
-    source = f"{name}, {steps} random steps, seed {seed}"
-    return RatingLog(ratings=ratings, source=source, **columns)  # type: ignore[arg-type]
+    return columns
+
+
+def _drop_absent(columns: dict[str, list[Any]]) -> dict[str, list[Any]]:
+    """Leave out the columns that are None everywhere; one that is so in some rows only is an error."""
+    for name, column in columns.items():
+        absent = [v is None for v in column]
+        if any(absent) and not all(absent):
+            row = absent.index(not absent[0])
+            raise bad_cell("rollout", row, name, column[row], "in info at every step, or at none")
+    return {name: column for name, column in columns.items() if column[0] is not None}

@@ -1,7 +1,7 @@
 """The filter for somebody else's training: rewards and ratings go in step by step, rewards to learn from come out.
 
-A ``RewardStream`` is all that the adapters share. Where state-actions come again (``keys``) it remembers what was said
-of each; where none comes twice, a step's own ratings are all that is known of it, and a uniform sample of all rated steps
+A ``RewardStream`` is all that the adapters share. Where state-actions come again (``keys``) it remembers the ratings of
+each; where none comes twice, a step's own ratings are all that is known of it, and a uniform sample of all rated steps
 stands for the others.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Hashable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from uard.method.mitigations import Evidence, Mitigation, uard
 from uard.ratings.aggregate import aggregate, nothing
 from uard.ratings.memory import FeedbackTable, RatingSample
 
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
 PATIENCE = 1000  # steps without any rating before we say so
 
 
@@ -28,7 +31,7 @@ class NeverRatedWarning(UserWarning):
 
 
 class Filtered(NamedTuple):
-    """Rewards to learn from, and why; arrays (B,) of float64 in reward units.
+    """The rewards of B steps, filtered, and why; in reward units.
 
     Attributes:
         reward: What to learn from.
@@ -37,34 +40,43 @@ class Filtered(NamedTuple):
         sigma_h: Disagreement of the raters (and of the proxy with them); 0 where nobody has rated.
         sigma_m: Disagreement of the ensemble.
         lam: lambda_t; 0 for a mitigation that has none.
-        abstained: Whether the rule for abstention would not have acted on this (bool).
-        rated: Whether this step was rated itself (bool).
+        abstained: Whether the rule for abstention would not have acted on this.
+        rated: Whether this step was rated itself.
     """
 
-    reward: np.ndarray
-    raw: np.ndarray
-    weight: np.ndarray
-    sigma_h: np.ndarray
-    sigma_m: np.ndarray
-    lam: np.ndarray
-    abstained: np.ndarray
-    rated: np.ndarray
+    reward: Float[np.ndarray, " B"]
+    raw: Float[np.ndarray, " B"]
+    weight: Float[np.ndarray, " B"]
+    sigma_h: Float[np.ndarray, " B"]
+    sigma_m: Float[np.ndarray, " B"]
+    lam: Float[np.ndarray, " B"]
+    abstained: Bool[np.ndarray, " B"]
+    rated: Bool[np.ndarray, " B"]
 
 
 class Observed(NamedTuple):
-    """What ``RewardStream.observe`` has taken in of (B,) steps.
+    """What ``RewardStream.observe`` has taken in of B steps.
 
     Attributes:
-        visit: What was said of the steps themselves.
-        slots: Where each step's state-action is kept, (B,); None without keys.
+        visit: The ratings of the steps themselves.
+        slots: Where each step's state-action is kept; None without keys.
     """
 
     visit: Feedback
-    slots: np.ndarray | None
+    slots: Int[np.ndarray, " B"] | None
 
 
 class RewardStream:
     """Filters rewards as they come. Changed in place; pickling keeps all that it knows.
+
+    Examples:
+        >>> stream = RewardStream()
+        >>> reward = [4.0] + 9 * [-0.1]  # raters contest the first and agree on the others
+        >>> ratings = [[-1.0, 2.0, 1.0]] + 9 * [[-0.1, -0.1, -0.1]]
+        >>> for _ in range(30):
+        ...     out = stream(reward, ratings, keys=range(10))
+        >>> out.weight[:2].round(2).tolist(), out.reward[:2].round(2).tolist()
+        ([0.03, 0.94], [-0.8, -0.1])
 
     Attributes:
         mitigation: What is done with a reward.
@@ -83,24 +95,22 @@ class RewardStream:
         refresh: int = 256,
         seed: int = 0,
     ):
-        """Start knowing nothing.
+        """Start without any rating.
 
         Args:
             mitigation: What to do with a reward; ``uard()`` if left out. It must change rewards only.
             abstention: See the attribute.
             ddof: Of sigma_h.
             capacity: Rated steps kept where steps have no keys, >= 2.
-            refresh: Rated steps after which the panel's statistics are measured anew, >= 1 (more often at first).
+            refresh: Rated steps after which the panel's statistics are measured again, >= 1 (more often at first).
             seed: Of the sample of steps that are kept.
 
         Raises:
             InvalidValueError: for a mitigation that needs more than rewards.
         """
-        self.mitigation = uard() if mitigation is None else mitigation
-        if not isinstance(self.mitigation, Mitigation):
-            raise _checks.InvalidValueError(
-                "mitigation", mitigation, "a Mitigation (see uard.method.mitigations.named)"
-            )
+        mitigation = uard() if mitigation is None else mitigation
+        allowed = "a Mitigation (see uard.method.mitigations.named)"
+        self.mitigation = _checks.instance("mitigation", mitigation, Mitigation, allowed)
         if self.mitigation.acts_on != "reward":
             raise _checks.InvalidValueError(
                 "mitigation.acts_on", self.mitigation.acts_on, "'reward': actions are not chosen here"
@@ -127,7 +137,7 @@ class RewardStream:
         sigma_m: Any = None,
         keys: Sequence[Hashable] | None = None,
     ) -> Filtered:
-        """Observe what was said of some steps, and return their rewards, filtered.
+        """Observe the ratings of some steps, and return their rewards, filtered.
 
         Args:
             reward: Observed rewards (B,), finite.
@@ -138,16 +148,19 @@ class RewardStream:
         Raises:
             InvalidValueError: naming field, place, value and what is allowed.
         """
-        visit, slots = self.observe(reward, ratings, keys)
+        checked = _column("reward", reward)
+        visit, slots = self._observe(checked, ratings, keys)
         known = visit if slots is None else self.known(slots)
-        return self.filter(reward, known, sigma_m, keyed=slots is not None, rated=visit.count > 0)
+        return self._filter(checked, known, sigma_m, slots is not None, visit.count > 0)
 
     def observe(self, reward: Any, ratings: Any = None, keys: Sequence[Hashable] | None = None) -> Observed:
-        """Remember what was said of some steps; see ``__call__``."""
-        reward = _column("reward", reward)
+        """Remember the ratings of some steps; arguments and errors are those of ``__call__``."""
+        return self._observe(_column("reward", reward), ratings, keys)
+
+    def _observe(self, reward: Float[np.ndarray, " B"], ratings: Any, keys: Sequence[Hashable] | None) -> Observed:
         ratings = np.full((len(reward), 1), np.nan) if ratings is None else _checks.as_numpy("ratings", ratings)
         visit = aggregate(ratings, reward, ddof=self.ddof)
-        rated = np.flatnonzero(visit.count)
+        rated = visit.count.nonzero()[0]
         self._steps += len(reward)
         self.rated += len(rated)
         if self.rated == 0 and self._steps >= PATIENCE and not self._warned and self.mitigation.reads_feedback:
@@ -159,7 +172,7 @@ class RewardStream:
                 stacklevel=3,
             )
         if keys is None:
-            self._sample.put(ratings[rated], reward[rated])
+            self._sample.put(visit if len(rated) == len(reward) else visit.map(lambda x: x[rated]))
             return Observed(visit, None)
         if len(keys) != len(reward):
             raise _checks.InvalidValueError("len(keys)", len(keys), f"{len(reward)}, one per reward")
@@ -167,15 +180,7 @@ class RewardStream:
         self._table.observe(slots, visit, len(self._slots))
         return Observed(visit, slots)
 
-    def filter(
-        self,
-        reward: Any,
-        known: Feedback,
-        sigma_m: Any = None,
-        *,
-        keyed: bool,
-        rated: np.ndarray | None = None,
-    ) -> Filtered:
+    def filter(self, reward: Any, known: Feedback, sigma_m: Any = None, *, keyed: bool) -> Filtered:
         """Filter rewards by what is known; nothing is remembered.
 
         Args:
@@ -183,43 +188,60 @@ class RewardStream:
             known: Of the steps' state-actions, (B,) arrays: the visit itself, or ``known(slots)``.
             sigma_m: (B,) or None.
             keyed: Whether that comes from a table of state-actions that come again.
-            rated: (B,) of bool, which steps were rated themselves; those with a count if left out.
+
+        Returns:
+            ``rated`` is true where anything is known.
+
+        Raises:
+            InvalidValueError: naming field, place, value and what is allowed.
         """
-        reward = _column("reward", reward)
-        sigma_m = np.zeros(len(reward)) if sigma_m is None else _column("sigma_m", sigma_m, nonnegative=True)
+        return self._filter(_column("reward", reward), known, sigma_m, keyed, known.count > 0)
+
+    def _filter(
+        self,
+        reward: Float[np.ndarray, " B"],
+        known: Feedback,
+        sigma_m: Any,
+        keyed: bool,
+        rated: Bool[np.ndarray, " B"],
+    ) -> Filtered:
+        zeros = np.zeros(len(reward))
+        sigma_m = zeros if sigma_m is None else _column("sigma_m", sigma_m, nonnegative=True)
         if len(sigma_m) != len(reward):
             raise _checks.InvalidValueError("len(sigma_m)", len(sigma_m), f"{len(reward)}, one per reward")
         mitigation = self.mitigation if keyed else self._of_single_visits
         why = mitigation.explain(Evidence(reward, sigma_m, known), self._measured(keyed))
-        if np.any(np.asarray(why.signal.sample_weight) != 1.0):
+        if not _is_one(why.signal.sample_weight):
             raise _checks.InvalidValueError(
                 "mitigation", self.mitigation, "one that changes rewards; this one leaves steps out of learning"
             )
-        zeros = np.zeros(len(reward))
         out = np.asarray(why.signal.reward, np.float64) + zeros
         _checks.finite("filtered reward", out)
-        abstained = zeros.astype(bool) if self.abstention is None else self.abstention.abstains(why.doubt, reward)
-        rated = known.count > 0 if rated is None else rated
+        abstained = zeros > 0 if self.abstention is None else self.abstention.abstains(why.doubt, reward)
         return Filtered(out, reward, why.weight + zeros, why.sigma_h, sigma_m, why.lam + zeros, abstained, rated)
 
-    def known(self, slots: np.ndarray) -> Feedback:
+    def known(self, slots: Int[np.ndarray, " B"]) -> Feedback:
         """Return what is known of state-actions at places that ``observe`` gave, (B,) arrays."""
         return self._table[slots]
 
     def _measured(self, keyed: bool) -> Any:
-        """Return the panel's statistics, measured anew when enough has been rated since."""
+        """Return the panel's statistics, measured again when enough has been rated since."""
         if self.rated >= self._due:
             self._statistics.clear()
             self._due = self.rated + max(1, min(self.rated, self._refresh))
         if keyed not in self._statistics:
-            every = self._table.every() if keyed else self._sample.feedback(self.ddof)
+            every = self._table.every() if keyed else self._sample.feedback()
             if not len(every.count):
                 every = nothing((1,), 1)
             self._statistics[keyed] = self.mitigation.fit(every, every.count > 0)
         return self._statistics[keyed]
 
 
-def _column(field: str, values: Any, nonnegative: bool = False) -> np.ndarray:
+def _is_one(sample_weight: Any) -> bool:
+    return sample_weight == 1.0 if isinstance(sample_weight, float) else bool(np.all(sample_weight == 1.0))
+
+
+def _column(field: str, values: Any, nonnegative: bool = False) -> Float[np.ndarray, " B"]:
     values = _checks.as_numpy(field, values)
     if values.ndim != 1:
         raise _checks.InvalidValueError(f"{field}.shape", values.shape, "(B,), one number per step")

@@ -7,16 +7,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from uard.adapters.trl.reward import (
-    Judged,
-    RewardModel,
-    UncertaintyDiscountedReward,
-    UnscoredWarning,
-    advantage_change,
-    groups_of,
-    keeps_factor,
-)
-from uard.judges.asking import JudgeError
+from uard.adapters.trl.advantages import advantage_change, groups_of, keeps_factor
+from uard.adapters.trl.reward import Judged, UncertaintyDiscountedReward, UnscoredWarning
+from uard.adapters.trl.reward_model import RewardModel
+from uard.judges import JudgeError
 
 if TYPE_CHECKING:
     from uard.adapters.trl.callback import (

@@ -1,4 +1,4 @@
-"""The callback of the TRL adapter; apart, because it alone needs transformers before anything is trained."""
+"""The callback of the TRL adapter; a file of its own, because it alone needs transformers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ except ModuleNotFoundError as error:
     ) from error
 
 from uard import _checks
-from uard.adapters.trl.reward import UncertaintyDiscountedReward, keeps_factor
+from uard.adapters.trl.advantages import keeps_factor
+from uard.adapters.trl.reward import UncertaintyDiscountedReward
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +31,7 @@ class DiscountCancelledWarning(UserWarning):
 
 
 class UselessJudgeWarning(UserWarning):
-    """A judge cannot be compared with the others, or says what they say."""
+    """A judge cannot be compared with the others, or always agrees with them."""
 
 
 class ForgottenWarning(UserWarning):
@@ -44,6 +45,17 @@ class ReliabilityCallback(TrainerCallback):
     the same advantages without it, under this trainer's configuration), of a judge that never varies or never scores,
     of judges that never disagree, and of a reward that the trainer does not call. What the reward knows is kept in
     every checkpoint and read again when training is resumed.
+
+    Examples:
+        >>> def length(completions, **question):
+        ...     return [len(text) for text in completions]
+        >>> def clarity(completions, **question):
+        ...     return [-text.count("um") for text in completions]
+        >>> reward = UncertaintyDiscountedReward([length, clarity])
+        >>> callback = ReliabilityCallback(reward)  # GRPOTrainer(..., reward_funcs=reward, callbacks=[callback])
+        >>> learned = reward(["why?"] * 2, ["so", "um, so"])
+        >>> print(callback.report().splitlines()[0])
+        2 completions, 0 without any score, 0 that could not be checked; mean weight ...
 
     Attributes:
         reward: What is watched.
@@ -60,10 +72,10 @@ class ReliabilityCallback(TrainerCallback):
         Raises:
             InvalidValueError: for another kind of reward.
         """
-        if not isinstance(reward, UncertaintyDiscountedReward):
-            raise _checks.InvalidValueError("reward", reward, "an UncertaintyDiscountedReward")
+        allowed = "an UncertaintyDiscountedReward"
+        self.reward = _checks.instance("reward", reward, UncertaintyDiscountedReward, allowed)
         _checks.whole("patience", patience, low=1)
-        self.reward, self.patience = reward, patience
+        self.patience = patience
         self._warned: set[str] = set()
 
     def on_train_begin(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
@@ -78,7 +90,7 @@ class ReliabilityCallback(TrainerCallback):
         else:
             warnings.warn(
                 f"training is resumed at step {state.global_step}, but {file} does not exist: the judges' scales and "
-                "what disagreement is usual are learned anew",
+                "their mean disagreement start again from nothing",
                 ForgottenWarning,
                 stacklevel=2,
             )
@@ -90,7 +102,7 @@ class ReliabilityCallback(TrainerCallback):
         file.write_bytes(pickle.dumps(self.reward.memory))
 
     def on_step_end(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
-        """Look for what deserves a warning."""
+        """Warn, if there is reason to."""
         tally = self.reward.tally
         if tally.completions == 0:
             self._warn(
@@ -120,7 +132,7 @@ class ReliabilityCallback(TrainerCallback):
         log.info("%s", self.report())
 
     def report(self) -> str:
-        """Return what has been seen so far, for people."""
+        """Return a summary of all completions so far, as text."""
         tally = self.reward.tally
         scored = tally.completions - tally.unscored
         lines = [

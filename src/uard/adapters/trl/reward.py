@@ -5,9 +5,9 @@ TRL adds the reward functions of a list up, so their disagreement is lost. Here 
     reward = UncertaintyDiscountedReward([relevance, clarity, RewardModel(model, tokenizer)])
     trainer = GRPOTrainer(..., reward_funcs=reward, callbacks=[ReliabilityCallback(reward)])
 
-**What normalisation leaves of the discount.** A completion earns b + w (r - b): r is what the judges say together, b
+**What normalisation leaves of the discount.** A completion earns b + w (r - b): r is the judges' weighted mean, b
 the lowest of them, w how far r is believed. Trainers compare the completions of one prompt, so what *differs* among
-them survives: a contested completion falls behind its siblings. What they share does not:
+them survives: a contested completion falls behind the others. What they share does not:
 
 * a *shift*, the same w and r - b for all completions of a prompt, is always lost with the mean of the group: judges
   who disagree about the prompt only, by the same amount for each completion, change nothing;
@@ -27,18 +27,21 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from uard import _checks
-from uard.judges.asking import Judge, Scale, as_scores, ask, by_name
+from uard.adapters.trl.advantages import advantage_change, group_means, groups_of
+from uard.judges import Judge, Scale, as_scores, ask, by_name
 from uard.method.mitigations import Mitigation, uard
 from uard.ratings.stream import RewardStream
 
+if TYPE_CHECKING:
+    from jaxtyping import Float, Integer
+
 DISCOUNTED = 0.9  # a group whose mean weight is below this is discounted
 CANCELLED = 0.05  # and its discount cancelled, if the normalised advantages change by less than this
-EQUAL = 1e-9  # length of a group's centred rewards at which they count as equal
 
 
 class UnscoredWarning(UserWarning):
@@ -46,28 +49,28 @@ class UnscoredWarning(UserWarning):
 
 
 class Judged(NamedTuple):
-    """What became of one batch of B completions; NaN where no judge scored a completion.
+    """What became of one batch of B completions, in standard deviations of a judge; NaN where no judge scored one.
 
     Attributes:
-        scores: (B, K), as the K judges gave them; NaN where one is missing.
-        ratings: (B, K), in standard deviations of each judge; NaN where a score is missing or its judge has given
+        scores: As the K judges gave them, in units of their own; NaN where one is missing.
+        ratings: The same in standard deviations of each judge; NaN where a score is missing or its judge has given
             nothing but this score so far.
-        raw: (B,), the proxy r: the judges' weighted mean, or the judge that was named as the proxy.
-        reward: (B,), b + w (r - b): what is learned from.
-        weight: (B,), w in [0, 1].
-        sigma_h: (B,), the judges' disagreement; 0 for a completion with fewer than two ratings.
-        sigma_m: (B,), the disagreement of an ensemble; 0 without one.
-        lam: (B,), lambda_t.
+        raw: The proxy r: the judges' weighted mean, or the judge that was named as the proxy.
+        reward: b + w (r - b): what is learned from.
+        weight: w in [0, 1].
+        sigma_h: The judges' disagreement; 0 for a completion with fewer than two ratings.
+        sigma_m: The disagreement of an ensemble; 0 without one.
+        lam: lambda_t.
     """
 
-    scores: np.ndarray
-    ratings: np.ndarray
-    raw: np.ndarray
-    reward: np.ndarray
-    weight: np.ndarray
-    sigma_h: np.ndarray
-    sigma_m: np.ndarray
-    lam: np.ndarray
+    scores: Float[np.ndarray, "B K"]
+    ratings: Float[np.ndarray, "B K"]
+    raw: Float[np.ndarray, " B"]
+    reward: Float[np.ndarray, " B"]
+    weight: Float[np.ndarray, " B"]
+    sigma_h: Float[np.ndarray, " B"]
+    sigma_m: Float[np.ndarray, " B"]
+    lam: Float[np.ndarray, " B"]
 
 
 @dataclass
@@ -102,8 +105,8 @@ class UncertaintyDiscountedReward:
 
     The judges' scores are brought to one scale; their weighted mean is the proxy r, their disagreement sigma_h. What is
     learned from is b + w (r - b): r, drawn towards the lowest judge b the further, the more the judges disagree
-    compared with what is usual among all completions so far (``uard.method.mitigations.uard``). Its unit is a judge's standard
-    deviation.
+    compared with their mean disagreement over all completions so far (``uard.method.mitigations.uard``). Its unit is a
+    judge's standard deviation.
 
     A score of None or NaN is missing: the other judges decide. A completion with fewer than two ratings has nothing to
     be checked against and is believed as little as the mitigation believes unrated steps. One that no judge scored gets
@@ -111,6 +114,16 @@ class UncertaintyDiscountedReward:
 
     Every call changes it; pickling keeps all that it knows. In distributed training each process has its own running
     scales: give ``scales`` if groups are split over processes.
+
+    Examples:
+        >>> def length(completions, **question):
+        ...     return [len(text) for text in completions]
+        >>> def clarity(completions, **question):
+        ...     return [-text.count("um") for text in completions]
+        >>> reward = UncertaintyDiscountedReward([length, clarity])
+        >>> learned = reward(["why?"] * 3, ["so", "therefore", "um, um, therefore"])
+        >>> [f"{x:.1f}" for x in reward.last.raw], [f"{x:.1f}" for x in learned]
+        (['-0.2', '0.3', '-0.1'], ['-0.5', '0.3', '-1.3'])
 
     Attributes:
         judges: The judges by name.
@@ -190,11 +203,19 @@ class UncertaintyDiscountedReward:
         prompts: Sequence[Any],
         completions: Sequence[Any],
         completion_ids: Any = None,
-        log_extra: Callable[[str, list], None] | None = None,
+        log_extra: Callable[[str, list[Any]], None] | None = None,
         log_metric: Callable[[str, float], None] | None = None,
         **columns: Any,
     ) -> list[float | None]:
         """Return one reward per completion, None where no judge scored it; TRL calls this.
+
+        Args:
+            prompts: B prompts; neighbours with the same prompt are a group.
+            completions: B completions, as texts or as lists of messages.
+            completion_ids: Their tokens, for judges that read them.
+            log_extra: Given a name and B values, of which TRL logs a column beside the completions.
+            log_metric: Given a name and a number, which TRL logs.
+            columns: Other columns of the data set, for the judges.
 
         Raises:
             JudgeError: if a judge raises.
@@ -219,8 +240,8 @@ class UncertaintyDiscountedReward:
             self._log_means(self.last, change, log_metric)
         return [None if math.isnan(reward) else reward for reward in self.last.reward.tolist()]
 
-    def _ensemble(self, answers: dict[str, Any], size: int) -> np.ndarray:
-        """Return sigma_m (size,) from what the ensemble answered, if there is one."""
+    def _ensemble(self, answers: dict[str, Any], size: int) -> Float[np.ndarray, " B"]:
+        """Return sigma_m from what the ensemble answered, if there is one."""
         if self._sigma_m is None:
             return np.zeros(size)
         values = _checks.as_numpy("sigma_m", answers["sigma_m"])
@@ -229,12 +250,12 @@ class UncertaintyDiscountedReward:
             return values
         if values.ndim != 2 or len(values) != size or values.shape[1] < 2:
             allowed = f"({size},) or ({size}, N) with N >= 2 members"
-            raise _checks.InvalidValueError("shape of what sigma_m gave", values.shape, allowed)
+            raise _checks.InvalidValueError("shape of the answer of sigma_m", values.shape, allowed)
         _checks.finite("sigma_m", values)
         self._members.observe(values)
         return np.std(values, axis=1, ddof=1) / (self._members.deviation or 1.0)
 
-    def _discount(self, scores: np.ndarray, sigma_m: np.ndarray) -> Judged:
+    def _discount(self, scores: Float[np.ndarray, "B K"], sigma_m: Float[np.ndarray, " B"]) -> Judged:
         here = ~np.isnan(scores)
         for judge, scale in enumerate(self._scales):
             scale.observe(scores[here[:, judge], judge])
@@ -245,16 +266,17 @@ class UncertaintyDiscountedReward:
         checked = (~np.isnan(ratings)).sum(1, keepdims=True) >= 2
         filtered = self._stream(raw[scored], np.where(checked, ratings, np.nan)[scored], sigma_m[scored])
 
-        def whole(values: np.ndarray) -> np.ndarray:
+        def whole(values: Float[np.ndarray, " scored"]) -> Float[np.ndarray, " B"]:
             column = np.full(len(scores), np.nan)
             column[scored] = values
             return column
 
-        names = ("raw", "reward", "weight", "sigma_h", "sigma_m", "lam")
-        return Judged(scores, ratings, *(whole(getattr(filtered, name)) for name in names))
+        f = filtered
+        columns = (f.raw, f.reward, f.weight, f.sigma_h, f.sigma_m, f.lam)
+        return Judged._make([scores, ratings, *map(whole, columns)])
 
-    def _combine(self, ratings: np.ndarray) -> np.ndarray:
-        """Return the proxy (B,); 0, the usual, where nobody tells completions apart."""
+    def _combine(self, ratings: Float[np.ndarray, "B K"]) -> Float[np.ndarray, " B"]:
+        """Return the proxy; 0, the mean of all completions so far, where no judge tells completions apart."""
         here = ~np.isnan(ratings)
         total = here @ self._weights
         mean = np.where(here, ratings, 0.0) @ self._weights / np.where(total > 0, total, 1.0)
@@ -278,20 +300,24 @@ class UncertaintyDiscountedReward:
         tally.weight += float(np.nansum(judged.weight))
         tally.widest = float(np.max(judged.sigma_h, initial=tally.widest, where=~unscored))
 
-    def _count_groups(self, judged: Judged, groups: np.ndarray, change: np.ndarray) -> None:
-        discounted = ~np.isnan(change) & (_group_means(judged.weight, groups) < DISCOUNTED)
+    def _count_groups(
+        self, judged: Judged, groups: Integer[np.ndarray, " B"], change: Float[np.ndarray, " groups"]
+    ) -> None:
+        discounted = ~np.isnan(change) & (group_means(judged.weight, groups) < DISCOUNTED)
         undivided = advantage_change(judged.raw, judged.reward, groups, divided=False)
         self.tally.discounted += int(discounted.sum())
         self.tally.shifted += int((discounted & (undivided < CANCELLED)).sum())
         self.tally.cancelled += int((discounted & (change < CANCELLED)).sum())
 
-    def _log_completions(self, judged: Judged, log_extra: Callable[[str, list], None]) -> None:
+    def _log_completions(self, judged: Judged, log_extra: Callable[[str, list[Any]], None]) -> None:
         columns = {name: judged.scores[:, k] for k, name in enumerate(self.judges)}
         columns |= {name: getattr(judged, name) for name in ("raw", "weight", "sigma_h", "sigma_m")}
         for name, values in columns.items():
             log_extra(f"{self.__name__}/{name}", [None if math.isnan(x) else x for x in values.tolist()])
 
-    def _log_means(self, judged: Judged, change: np.ndarray, log_metric: Callable[[str, float], None]) -> None:
+    def _log_means(
+        self, judged: Judged, change: Float[np.ndarray, " groups"], log_metric: Callable[[str, float], None]
+    ) -> None:
         missing = np.isnan(judged.scores)
         values = {f"{name}/missing": missing[:, k].mean() for k, name in enumerate(self.judges)}
         values |= {f"{name}/mean": _mean(judged.scores[:, k]) for k, name in enumerate(self.judges)}
@@ -302,116 +328,12 @@ class UncertaintyDiscountedReward:
                 log_metric(f"{self.__name__}/{name}", float(value))
 
 
-class RewardModel:
-    """A reward model as a judge: a model for sequence classification, and its tokenizer.
-
-    It reads prompt and completion together, as TRL lets its reward models read them. With one label the score is its
-    logit; a model with N labels is an ensemble of N heads and belongs into ``sigma_m``.
-
-    Attributes:
-        model: The model; it stays on the device where it is.
-        tokenizer: Its tokenizer, with a chat template if prompts are conversations.
-    """
-
-    def __init__(self, model: Any, tokenizer: Any, *, name: str = "reward_model", batch_size: int = 64):
-        """Take a model and its tokenizer, and set both up for padding as TRL does.
-
-        Args:
-            model: For example transformers' ``AutoModelForSequenceClassification``.
-            tokenizer: Without a padding token, it gets its end token for one.
-            name: The judge's name.
-            batch_size: Completions read at once, >= 1.
-        """
-        _checks.whole("batch_size", batch_size, low=1)
-        if tokenizer.pad_token_id is None:
-            tokenizer.pad_token = tokenizer.eos_token
-        model.config.get_text_config().pad_token_id = tokenizer.pad_token_id
-        self.model, self.tokenizer, self.__name__ = model.eval(), tokenizer, name
-        self._batch_size = batch_size
-
-    def __call__(self, prompts: Sequence[Any], completions: Sequence[Any], **columns: Any) -> list:
-        """Return one score per completion, or a row of scores if the model has several labels."""
-        import torch
-
-        texts = [self._text(prompt, completion) for prompt, completion in zip(prompts, completions, strict=True)]
-        scores = []
-        for start in range(0, len(texts), self._batch_size):
-            inputs = self.tokenizer(
-                texts[start : start + self._batch_size],
-                return_tensors="pt",
-                padding=True,
-                padding_side="right",
-                add_special_tokens=False,
-            )
-            with torch.inference_mode():
-                scores += self.model(**inputs.to(self.model.device)).logits.float().tolist()
-        return [row[0] if len(row) == 1 else row for row in scores]
-
-    def _text(self, prompt: Any, completion: Any) -> str:
-        if isinstance(prompt, str):
-            return prompt + completion
-        return self.tokenizer.apply_chat_template([*prompt, *completion], tokenize=False)
-
-
-def groups_of(prompts: Sequence[Any]) -> np.ndarray:
-    """Number the groups of a batch from 0, (B,): neighbours with the same prompt, as TRL's samplers lay them out."""
-    texts = [repr(prompt) for prompt in prompts]
-    return np.cumsum([i > 0 and text != texts[i - 1] for i, text in enumerate(texts)])
-
-
-def advantage_change(raw: np.ndarray, reward: np.ndarray, groups: np.ndarray, *, divided: bool = True) -> np.ndarray:
-    """How much the discount changes the advantages of each group, relative to the longer of the two vectors.
-
-    0 where normalisation cancels the discount; if the advantages with and without it correlate by rho, it is
-    sqrt(2 - 2 rho) of divided ones; 1 if only one of them is flat.
-
-    Args:
-        raw: Rewards without the discount (B,), NaN where there is none.
-        reward: Rewards with it (B,), NaN in the same places.
-        groups: The number of each completion's group (B,), from 0.
-        divided: Whether a group's advantages are divided by their standard deviation, or only centred.
-
-    Returns:
-        One number in [0, 2] per group; NaN where all rewards of the group are equal, with and without.
-    """
-    before, after = _centred(raw, groups), _centred(reward, groups)
-    lengths = np.sqrt([np.bincount(groups, before**2), np.bincount(groups, after**2)])
-    if divided:
-        before, after = (x / np.where(n > 0, n, 1.0)[groups] for x, n in zip((before, after), lengths, strict=True))
-        lengths = np.sign(lengths)
-    longer = lengths.max(0)
-    return np.sqrt(np.bincount(groups, (after - before) ** 2)) / np.where(longer > 0, longer, np.nan)
-
-
-def keeps_factor(config: Any) -> bool:
-    """Whether a factor that all completions of a prompt share changes their advantages under this configuration.
-
-    Args:
-        config: A GRPOConfig or RLOOConfig. GRPO divides by the group's deviation with ``scale_rewards="group"`` and
-            with ``multi_objective_aggregation="normalize_then_sum"``; RLOO never does.
-    """
-    divides = getattr(config, "scale_rewards", "none") in ("group", True)
-    return not divides and getattr(config, "multi_objective_aggregation", "") != "normalize_then_sum"
-
-
-def _centred(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Subtract each group's mean; 0 where a value is missing or the group's are equal up to rounding."""
-    centred = np.nan_to_num(values - _group_means(values, groups)[groups])
-    return np.where(np.bincount(groups, centred**2)[groups] > EQUAL**2, centred, 0.0)
-
-
-def _group_means(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Mean of each group's values, without the missing ones; NaN where all are missing."""
-    total, known = np.bincount(groups, np.nan_to_num(values)), np.bincount(groups, ~np.isnan(values))
-    return total / np.where(known > 0, known, np.nan)
-
-
-def _mean(values: np.ndarray) -> float:
+def _mean(values: Float[np.ndarray, " n"]) -> float:
     known = values[~np.isnan(values)]
     return float(known.mean()) if known.size else math.nan
 
 
-def _weights(weights: Sequence[float] | None, number: int) -> np.ndarray:
+def _weights(weights: Sequence[float] | None, number: int) -> Float[np.ndarray, " K"]:
     if weights is None:
         return np.ones(number)
     if len(weights) != number:
@@ -426,7 +348,7 @@ def _scales(scales: Sequence[tuple[float, float] | None] | None, number: int) ->
         return [Scale() for _ in range(number)]
     if len(scales) != number:
         raise _checks.InvalidValueError("len(scales)", len(scales), f"{number}, one per judge")
-    made = []
+    made: list[Scale] = []
     for judge, pair in enumerate(scales):
         location, deviation = (0.0, None) if pair is None else pair
         _checks.number(f"scales[{judge}][0]", location)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from uard import _checks
 from uard.method import uncertainty
@@ -14,15 +14,19 @@ from uard.method.mitigations.panel_statistics import PanelStatistics
 from uard.method.mitigations.protocol import Evidence, LearningSignal, Mitigation
 from uard.method.weights import discount
 
-
-def shrink_unrated(reward: Array, lowest: Array, weight: Array) -> Array:
-    """Shrink a reward that nobody has rated towards what a step is usually worth at least."""
-    return discount(reward, weight, lowest)
+if TYPE_CHECKING:
+    from jaxtyping import Bool
 
 
 @dataclass(frozen=True)
 class Raw(Mitigation):
-    """Learn from the observed reward: no mitigation."""
+    """Learn from the observed reward: no mitigation.
+
+    Examples:
+        >>> from uard.ratings.stream import RewardStream
+        >>> RewardStream(Raw())([4.0], [[-1.0, 2.0, 1.0]]).reward.tolist()
+        [4.0]
+    """
 
     reads_feedback: ClassVar[bool] = False
 
@@ -38,6 +42,11 @@ Statistic = Literal["mean", "lowest", "bound"]
 class RatedReward(Mitigation):
     """Learn from a statistic of the ratings (its running mean) instead of the observed reward.
 
+    Examples:
+        >>> from uard.ratings.stream import RewardStream
+        >>> RewardStream(RatedReward("lowest"))([4.0], [[-1.0, 2.0, 1.0]]).reward.tolist()
+        [-1.0]
+
     Attributes:
         statistic: ``mean`` or ``lowest`` of the ratings, or ``bound``: mean - k sigma over the ratings and the
             observed reward.
@@ -51,17 +60,21 @@ class RatedReward(Mitigation):
     unrated_weight: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.choose("statistic", self.statistic, ("mean", "lowest", "bound"))
         _checks.number("k", self.k, low=0)
         _checks.number("unrated_weight", self.unrated_weight, low=0, high=1)
 
-    def fit(self, feedback: Feedback, rated: Array) -> PanelStatistics:
+    def fit(self, feedback: Feedback, rated: Bool[Array, "*batch"]) -> PanelStatistics:
         """Measure ``PanelStatistics``."""
         return panel_statistics.fit(feedback, rated, proxy_is_rater=False)
 
     def signal(self, evidence: Evidence, statistics: PanelStatistics) -> LearningSignal:
-        """Return the statistic."""
+        """Return the statistic; where nobody has rated, the reward shrunk towards the mean of the lowest ratings."""
         f, r = evidence.feedback, evidence.reward
         if self.statistic == "mean":
             rated = f.mean
@@ -70,7 +83,8 @@ class RatedReward(Mitigation):
         else:
             mean = (f.raters * f.mean + r) / (f.raters + 1.0)
             rated = mean - self.k * uncertainty.with_proxy(f.mean, f.sd, r, f.raters)
-        return LearningSignal(where(f.count > 0, rated, shrink_unrated(r, statistics.lowest, self.unrated_weight)), 1.0)
+        unrated = discount(r, self.unrated_weight, statistics.lowest)
+        return LearningSignal(where(f.count > 0, rated, unrated), 1.0)
 
 
 @dataclass(frozen=True)
@@ -78,6 +92,16 @@ class Screening(Mitigation):
     """Leave out of learning every step on which the raters disagree more than a threshold.
 
     The hard form of the filter: w in {0, 1}, and a step with w = 0 is skipped.
+
+    Examples:
+        >>> import numpy as np
+        >>> from uard.ratings.aggregate import aggregate
+        >>> reward = np.array([4.0, 0.0])
+        >>> feedback = aggregate(np.array([[-1.0, 1.0], [0.0, 0.0]]), reward)
+        >>> mitigation = Screening(limit=0.5)
+        >>> statistics = mitigation.fit(feedback, feedback.count > 0)
+        >>> mitigation.signal(Evidence(reward, np.zeros(2), feedback), statistics).sample_weight.tolist()
+        [0.0, 1.0]
 
     Attributes:
         limit: Largest sigma_h (proxy counted as a rater) that is still learned from, in units of the reward's
@@ -87,10 +111,14 @@ class Screening(Mitigation):
     limit: float = 0.5
 
     def __post_init__(self) -> None:
-        """Check the parameter."""
+        """Check the parameter.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.number("limit", self.limit, low=0, open_low=True)
 
-    def fit(self, feedback: Feedback, rated: Array) -> PanelStatistics:
+    def fit(self, feedback: Feedback, rated: Bool[Array, "*batch"]) -> PanelStatistics:
         """Measure the reward's scale."""
         return panel_statistics.fit(feedback, rated, proxy_is_rater=True)
 

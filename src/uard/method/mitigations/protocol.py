@@ -1,47 +1,52 @@
-"""What every mitigation is: from an observed reward and what is known of its ratings to the reward that is learned from.
+"""What every mitigation is: from an observed reward and what is known of its ratings to the reward that is learned.
 
-A mitigation knows no agent and no environment. A user's own is one small class:
-
-    >>> from dataclasses import dataclass
-    >>> from uard import LearningSignal, Mitigation
-    >>> @dataclass(frozen=True)
-    ... class Halve(Mitigation):
-    ...     factor: float = 0.5
-    ...     def signal(self, evidence, statistics):
-    ...         return LearningSignal(self.factor * evidence.reward, 1.0)
-
-All methods are pure and take NumPy, JAX or torch arrays of any one shape.
+A mitigation knows no agent and no environment. All methods are pure and take NumPy, JAX or torch arrays of any one
+shape.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
-from uard.method.arrays import Array, namespace
+from uard.method.arrays import Array, Numbers, namespace
 from uard.method.feedback import Feedback
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
 
 Backup = Literal["greedy", "consistent"]
 ActsOn = Literal["reward", "score", "both"]
 
 
 class Evidence(NamedTuple):
-    """All that a mitigation may know of a step: observed reward, ensemble disagreement, feedback."""
+    """All that a mitigation may know of some steps.
 
-    reward: Array
-    sigma_m: Array
+    Attributes:
+        reward: Observed.
+        sigma_m: Disagreement of an ensemble, in reward units, >= 0.
+        feedback: What is known of the ratings of these state-actions.
+    """
+
+    reward: Float[Array, "*batch"]
+    sigma_m: Float[Array, "*batch"]
     feedback: Feedback
 
 
 class LearningSignal(NamedTuple):
-    """The reward to learn from, and how much the step counts (0 skips it, 1 is a full step)."""
+    """What is learned of some steps.
 
-    reward: Array
-    sample_weight: Array
+    Attributes:
+        reward: The reward to learn from.
+        sample_weight: How much the step counts: 0 skips it, 1 is a full step. A number is meant for all.
+    """
+
+    reward: Float[Array, "*batch"]
+    sample_weight: Numbers
 
 
 class Explanation(NamedTuple):
-    """Why a reward is believed as far as it is; arrays of one shape.
+    """Why a reward is believed as far as it is.
 
     Attributes:
         signal: What is learned.
@@ -54,15 +59,28 @@ class Explanation(NamedTuple):
     """
 
     signal: LearningSignal
-    sigma_h: Array
-    lam: Array
-    weight: Array
-    anchor: Array
-    doubt: Array
+    sigma_h: Float[Array, "*batch"]
+    lam: Float[Array, "*batch"]
+    weight: Float[Array, "*batch"]
+    anchor: Float[Array, "*batch"]
+    doubt: Float[Array, "*batch"]
 
 
 class Mitigation(ABC):
     """What every mitigation has; all but ``signal`` have the defaults of one that changes rewards only.
+
+    A user's own is one small class:
+
+    Examples:
+        >>> from dataclasses import dataclass
+        >>> @dataclass(frozen=True)
+        ... class Halve(Mitigation):
+        ...     factor: float = 0.5
+        ...     def signal(self, evidence, statistics):
+        ...         return LearningSignal(self.factor * evidence.reward, 1.0)
+        >>> from uard.ratings.stream import RewardStream
+        >>> RewardStream(Halve())([4.0]).reward.tolist()
+        [2.0]
 
     Attributes:
         reads_feedback: Whether ratings are used at all; if not, none are drawn.
@@ -77,12 +95,12 @@ class Mitigation(ABC):
     acts_on: ActsOn = "reward"
     backup: Backup = "greedy"
 
-    def fit(self, feedback: Feedback, rated: Array) -> Any:
+    def fit(self, feedback: Feedback, rated: Bool[Array, "*batch"]) -> Any:
         """Return the statistics of the panel over all distinct state-actions, for the methods below.
 
         Args:
             feedback: Of every state-action.
-            rated: Which of them were rated (bool).
+            rated: Which of them were rated.
         """
         return ()
 
@@ -91,14 +109,20 @@ class Mitigation(ABC):
         """Return the reward to learn from; ``statistics`` is what ``fit`` returned."""
 
     def score(
-        self, mu: Array, sigma_m: Array, feedback: Feedback, statistics: Any, *, one_action: bool = False
-    ) -> Array:
+        self,
+        mu: Float[Array, "*batch A"],
+        sigma_m: Float[Array, "*batch A"],
+        feedback: Feedback,
+        statistics: Any,
+        *,
+        one_action: bool = False,
+    ) -> Float[Array, "*batch A"]:
         """Score actions, given mean values ``mu`` and the ensemble's disagreement; the agent prefers the highest.
 
         Args:
-            mu: (..., A) with the actions on the last axis, or any shape with ``one_action``.
-            sigma_m: Alike.
-            feedback: Alike.
+            mu: Mean value of every action, with the actions on the last axis; of any shape with ``one_action``.
+            sigma_m: The ensemble's disagreement, alike, in units of value, >= 0.
+            feedback: What is known of the ratings of these state-actions, alike.
             statistics: What ``fit`` returned.
             one_action: Whether every number is a state's only action, as with continuous actions.
         """

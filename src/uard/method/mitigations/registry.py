@@ -34,6 +34,16 @@ NAMED: dict[str, Callable[..., Mitigation]] = {
 def named(name: str, **parameters: Any) -> Mitigation:
     """Return the mitigation of that name, ours or a plugin's (``uard.plugins``), with some parameters changed.
 
+    Examples:
+        >>> named("worst-of-annotations")
+        RatedReward(statistic='lowest', k=1.0, unrated_weight=1.0)
+        >>> named("uard", kappa=0.0).kappa
+        0.0
+
+    Args:
+        name: One of ``NAMED``, or what an installed package calls its own.
+        parameters: Fields of the mitigation.
+
     Raises:
         UnknownNameError: with the nearest name.
         PluginError: a plugin that cannot be used.
@@ -44,5 +54,10 @@ def named(name: str, **parameters: Any) -> Mitigation:
 
 
 def is_mitigation(value: object) -> bool:
-    """Whether ``value`` has what a mitigation has."""
+    """Whether ``value`` is a mitigation.
+
+    Examples:
+        >>> is_mitigation(named("raw")), is_mitigation("raw")
+        (True, False)
+    """
     return isinstance(value, Mitigation)

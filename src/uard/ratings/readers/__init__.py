@@ -10,7 +10,7 @@ A log is a table with one row per step (or per completion, or per item that was 
 * ``episode``, ``step``: names of the row in messages.
 
 Other columns are left alone. Rows are counted from 1, without the header. ``nan``, ``na``, ``n/a``, ``null``, ``none``
-and nothing mean that a number is missing. NaN and infinity are read as they are: it is the doctor that speaks of them.
+and nothing mean that a number is missing. NaN and infinity are read as they are: the doctor reports them.
 """
 
 from __future__ import annotations
@@ -38,7 +38,16 @@ FORMATS: dict[str, Callable[[Path, Wanted], dict[str, Any]]] = {
 
 
 def read(path: str | Path, reward: str = "reward", ratings: Sequence[str] | None = None) -> RatingLog:
-    """Read a log from a file.
+    r"""Read a log from a file.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder) / "log.csv"
+        ...     _ = file.write_text("reward,rating_ann,rating_bob\n4,-1,\n0,0,0.1\n")
+        ...     log = read(file)
+        >>> log.raters, log.ratings.tolist()
+        (('rating_ann', 'rating_bob'), [[-1.0, nan], [0.0, 0.1]])
 
     Args:
         path: A ``.csv`` (or ``.tsv``), ``.jsonl`` (or ``.ndjson``) or ``.parquet`` file. Text is UTF-8; a CSV is
@@ -71,6 +80,10 @@ def from_columns(
     columns: Mapping[str, Any], reward: str = "reward", ratings: Sequence[str] | None = None, source: str = "log"
 ) -> RatingLog:
     """Take a log from named columns: a dict of lists or arrays, or a pandas data frame.
+
+    Examples:
+        >>> from_columns({"reward": [4.0, 0.0], "rating_ann": [-1.0, None]}).ratings.tolist()
+        [[-1.0], [nan]]
 
     Args:
         columns: Name to column; None and NaN mean that a number is missing.

@@ -5,19 +5,28 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from uard import _checks
 from uard.ratings.log import LABELS, NUMBERS, RatingLog, bad_cell
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 A_NUMBER = "a number, or nothing where it is missing"
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which columns of a source are read."""
+    """Which columns of a source are read.
+
+    Attributes:
+        source: What the source is called in messages.
+        reward: Name of the column of rewards.
+        ratings: Names of the annotators' columns; all that start with ``rating`` if None.
+    """
 
     source: str
     reward: str
@@ -35,7 +44,11 @@ class Wanted:
         return [n for r in self.ratings for n in others if n == r or n.startswith(f"{r}[")]
 
     def check(self, names: Sequence[str]) -> None:
-        """Say which columns are there if one that is needed is not."""
+        """Check that all columns that are needed are among ``names``, and each only once.
+
+        Raises:
+            InvalidValueError: with the names of the columns that are there.
+        """
         whole = {name.partition("[")[0] for name in names} | set(names)
         for needed in (self.reward, *(self.ratings or ())):
             if needed not in whole:
@@ -73,13 +86,18 @@ def assembled(columns: Mapping[str, Any], wanted: Wanted) -> RatingLog:
     )
 
 
+_NO_NUMBERS: tuple[type[Any], ...] = (bool, np.bool_, str, bytes)  # though float() would take them
 _PLAIN = frozenset((int, float, type(None), np.float64, np.float32, np.int64, np.int32))
 
 
-def numbers_of(cells: Any, column: str, source: str) -> np.ndarray:
-    """Return a column as floats, NaN where a number is missing; text is none, even if it reads like one."""
+def numbers_of(cells: Any, column: str, source: str) -> Float[np.ndarray, " n"]:
+    """Return a column as floats, NaN where a number is missing; text is none, even if it reads like one.
+
+    Raises:
+        InvalidValueError: a cell is no number; the message names row and column.
+    """
     if isinstance(cells, np.ndarray):
-        return cells
+        return cast("np.ndarray", cells)
     if set(map(type, cells)) <= _PLAIN:
         try:
             return np.array(cells, dtype=float)
@@ -92,7 +110,7 @@ def _number(cell: Any, row: int, column: str, source: str) -> float:
     if cell is None:
         return np.nan
     try:
-        if isinstance(cell, bool | np.bool_ | str | bytes):
+        if isinstance(cell, _NO_NUMBERS):
             raise TypeError
         return float(cell)
     except (TypeError, ValueError, OverflowError):
@@ -100,6 +118,10 @@ def _number(cell: Any, row: int, column: str, source: str) -> float:
 
 
 def no_binary(text: str, path: Path) -> None:
-    """Refuse text with NUL bytes."""
+    """Check that text has no NUL bytes.
+
+    Raises:
+        InvalidValueError: it has.
+    """
     if "\0" in text:
         raise _checks.InvalidValueError("log", str(path), "text, not binary data")

@@ -19,7 +19,12 @@ _CHUNK = 50_000  # rows of text that are held at a time
 
 
 def read_csv(path: Path, wanted: Wanted) -> dict[str, Any]:
-    """Return the wanted columns of a CSV file, in chunks so that its text is never held whole."""
+    """Return the wanted columns of a CSV file, in chunks so that its text is never held whole.
+
+    Raises:
+        InvalidValueError: there is no header, a column is missing, a row has another number of cells, or a cell is no
+            number; the message names row and column.
+    """
     with path.open(encoding="utf-8-sig", newline="") as file:
         first = file.readline()
         if not first.strip():

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from uard import _checks
 from uard.ratings.readers.columns import Wanted, no_binary
 
 
 def read_jsonl(path: Path, wanted: Wanted) -> dict[str, Any]:
-    """Return the wanted columns of a JSONL file; a list ``x`` becomes the columns ``x[0]``, ``x[1]`` ..."""
+    """Return the wanted columns of a JSONL file; a list ``x`` becomes the columns ``x[0]``, ``x[1]`` ...
+
+    Raises:
+        InvalidValueError: a line is no JSON object (the message names the row), or a row or column is missing.
+    """
     columns: dict[tuple[str, int | None], list[Any]] = {}
     others: set[str] = set()
     row = 0
@@ -32,7 +36,7 @@ def read_jsonl(path: Path, wanted: Wanted) -> dict[str, Any]:
                 continue
             for name, value in _entry(line, row, path, wanted.reward).items():
                 if isinstance(value, list):
-                    for part, cell in enumerate(value):
+                    for part, cell in enumerate(cast("list[Any]", value)):
                         put(name, part, cell)
                 else:
                     put(name, None, value)
@@ -49,11 +53,12 @@ def read_jsonl(path: Path, wanted: Wanted) -> dict[str, Any]:
 def _entry(line: str, row: int, path: Path, reward: str) -> dict[str, Any]:
     no_binary(line, path)
     try:
-        entry = json.loads(line)
+        entry: Any = json.loads(line)
     except (ValueError, RecursionError) as error:
         raise _checks.InvalidValueError(f"{path}: row {row + 1}", line.strip(), f"JSON ({error})") from None
     if not isinstance(entry, dict):
         raise _checks.InvalidValueError(f"{path}: row {row + 1}", entry, "a JSON object")
-    if reward not in entry:
-        raise _checks.UnknownNameError(f"{path}: row {row + 1}, column", reward, entry)
-    return entry
+    named = cast("dict[str, Any]", entry)
+    if reward not in named:
+        raise _checks.UnknownNameError(f"{path}: row {row + 1}, column", reward, named)
+    return named
