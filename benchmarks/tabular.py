@@ -300,7 +300,7 @@ def show(report: dict[str, Any]) -> None:
         table.add_column(heading, justify="right")
     for name, row in report["contenders"].items():
         numbers = [f"{row[k] / 1e6:.3g}" for k in ("median", "min", "max")]
-        found = [f"{row['late'][k]:.2f}" for k in ("trap_visits", "goal")] if row["late"] else ["", ""]
+        found = [f"{row['late'][k]:.2f}" for k in ("hacks", "success")] if row["late"] else ["", ""]
         table.add_row(name, *numbers, f"{1e9 / row['median']:.0f}", *found)
     console.print(table)
     table = Table("ratio", "median", "min", "max", "asked", "met")

@@ -85,7 +85,7 @@ def test_run_prints_one_json_object(printed):
         assert summary["mean"] == pytest.approx(sum(summary["per_seed"]) / 2)
         low, high = summary["ci95"]
         assert low <= summary["mean"] <= high
-    assert 0 <= answer["metrics"]["goal_rate"]["mean"] <= 1
+    assert 0 <= answer["metrics"]["success_rate"]["mean"] <= 1
     assert answer["steps_per_second"] > 0
     assert 2 * 60 <= answer["steps"] <= 2 * 60 * 40
     assert answer["seeds"] == [0, 1]

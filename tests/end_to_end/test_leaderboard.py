@@ -100,7 +100,7 @@ def test_every_cell_has_a_line_with_the_intervals_of_the_rest_of_the_report(boar
         (line,) = [x for x in board.lines if x.mitigation == _name(cell) and _where(x) == _where_of(cell)]
         for got, values in (
             (line.true, [r.metrics()["true_return"] for r in results]),
-            (line.hacks, [r.metrics()["trap_visits"] / r.metrics()["episode_length"] for r in results]),
+            (line.hacks, [r.metrics()["hacks"] / r.metrics()["episode_length"] for r in results]),
         ):
             want = statistics.summarise(values)
             np.testing.assert_allclose((got.mean, got.low, got.high), (want.mean, *want.ci95), rtol=1e-9, atol=1e-12)

@@ -70,7 +70,7 @@ def study(name):
     return Study(name, "t", "a", (row(Cell(), a=1),))
 
 def sections(evidence):
-    return [evidence.get("no such study", "trap_visits")]
+    return [evidence.get("no such study", "hacks")]
 
 def made_already(evidence):
     from uard.lab.views.sections import Section

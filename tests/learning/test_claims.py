@@ -67,35 +67,35 @@ def mean(per_seed):
 
 @pytest.mark.parametrize("visits", BASELINES)
 def test_the_plain_agent_hacks_as_much_as_the_papers(mean, visits):
-    assert mean(BASELINES[visits], "trap_visits") == pytest.approx(visits, abs=0.5)
-    assert mean(BASELINES[visits], "goal_rate") < 0.05
+    assert mean(BASELINES[visits], "hacks") == pytest.approx(visits, abs=0.5)
+    assert mean(BASELINES[visits], "success_rate") < 0.05
     assert mean(BASELINES[visits], "true_return") < -visits
 
 
 @pytest.mark.parametrize("panel", PANELS)
 def test_as_printed_it_hovers(mean, panel):
     cell = AS_PRINTED[panel]
-    assert mean(cell, "trap_visits") < 1.2
-    assert mean(cell, "goal_rate") < 0.1
+    assert mean(cell, "hacks") < 1.2
+    assert mean(cell, "success_rate") < 0.1
     assert mean(cell, "true_return") == pytest.approx(-4, abs=0.8)
 
 
 @pytest.mark.parametrize("key", TARGETS, ids=str)
 def test_uard_leaves_the_traps_and_reaches_the_goal(mean, key):
-    assert mean(TARGETS[key], "trap_visits") <= 0.15
-    assert mean(TARGETS[key], "goal_rate") >= 0.99
+    assert mean(TARGETS[key], "hacks") <= 0.15
+    assert mean(TARGETS[key], "success_rate") >= 0.99
 
 
 @pytest.mark.parametrize("panel", PANELS)
 def test_on_a_grid_that_nothing_was_tuned_on(mean, panel):
-    assert mean(ELSEWHERE[panel], "trap_visits") <= 0.2
-    assert mean(ELSEWHERE[panel], "goal_rate") >= 0.98
+    assert mean(ELSEWHERE[panel], "hacks") <= 0.2
+    assert mean(ELSEWHERE[panel], "success_rate") >= 0.98
 
 
 @pytest.mark.parametrize("key", NOISY, ids=str)
 def test_with_noisy_raters(mean, key):
-    assert mean(NOISY[key], "trap_visits") <= 0.2
-    assert mean(NOISY[key], "goal_rate") >= 0.98
+    assert mean(NOISY[key], "hacks") <= 0.2
+    assert mean(NOISY[key], "success_rate") >= 0.98
 
 
 @pytest.mark.parametrize("key", TWINS, ids=str)
@@ -108,8 +108,8 @@ def test_a_real_bonus_is_taken(mean, key):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_colluding_raters_fool_it(mean, size):
-    assert mean(FOOLED[size], "trap_visits") > 10
-    assert mean(FOOLED[size], "goal_rate") < 0.1
+    assert mean(FOOLED[size], "hacks") > 10
+    assert mean(FOOLED[size], "success_rate") < 0.1
 
 
 @pytest.mark.parametrize("panel", PANELS)

@@ -399,7 +399,7 @@ def test_the_chain_agrees_with_a_simulation():
         for value, sample in (
             (exact.visits, visits),
             (exact.visits_variance, (visits - visits.mean()) ** 2),
-            (exact.goal_rate, 1.0 - alive),
+            (exact.success_rate, 1.0 - alive),
             (exact.observed_return, total),
         ):
             assert value[i] == pytest.approx(sample.mean(), abs=5 * sample.std() / math.sqrt(episodes) + 1e-9)

@@ -79,7 +79,7 @@ def test_a_shift_in_one_metric_is_found_and_measured(compared):
         assert effect.difference == pytest.approx(3.0, abs=1.0)
         assert effect.effect == pytest.approx(effect.difference / np.sqrt(1 / 3), rel=0.5)
         assert effect.differs
-        assert not {e.metric: e for e in cell.effects}["trap_visits"].differs
+        assert not {e.metric: e for e in cell.effects}["hacks"].differs
     assert {e.metric for e in found.everywhere if e.differs} >= {"true_return"}
     assert lines(found)[-1] == "verdict: differ"
     assert json.loads(json.dumps(as_data(found), allow_nan=False))["differs"] is True

@@ -131,23 +131,23 @@ def test_published_results_come_back_and_stale_ones_do_not():
     rows = row(cell, agent="a"), row(small(noise=0.1), agent="b")
 
     def derive(cell, found):
-        return {"largest": [r.metrics()["trap_visits"] / 3 for r in found.values()]}
+        return {"largest": [r.metrics()["hacks"] / 3 for r in found.values()]}
 
-    study = Study("deep-baselines", "t", "", rows, ("trap_visits",), derive)
+    study = Study("deep-baselines", "t", "", rows, ("hacks",), derive)
     data = json.loads(json.dumps(extract((study,), store, range(3), "made so")))
     back = Published((study,), [data])
     assert [r["agent"] for r in back.rows("deep-baselines")] == ["a"]
-    expected = [r.metrics()["trap_visits"] for r in store.get(cell, range(3)).values()]
-    np.testing.assert_allclose(back.per_seed(study.rows[0], "trap_visits"), expected, rtol=1e-5)
-    assert back.curves(study.rows[0], "trap_visits").shape == (3, 20 // BIN)
+    expected = [r.metrics()["hacks"] for r in store.get(cell, range(3)).values()]
+    np.testing.assert_allclose(back.per_seed(study.rows[0], "hacks"), expected, rtol=1e-5)
+    assert back.curves(study.rows[0], "hacks").shape == (3, 20 // BIN)
     assert back.derived(study.rows[0], "rating_error").shape == (3, 5)
     np.testing.assert_allclose(back.derived(study.rows[0], "largest"), np.array(expected) / 3, rtol=1e-5)
     assert list(data["cells"]) == [cell.key]
-    assert list(data["cells"][cell.key]["curves"]) == ["trap_visits"]
+    assert list(data["cells"][cell.key]["curves"]) == ["hacks"]
     assert back.sources[0]["command"] == "made so"
     assert back.sources[0]["commit"] == checkout()
     with pytest.raises(LookupError, match="not published"):
-        back.get("deep-baselines", "trap_visits", agent="b")
+        back.get("deep-baselines", "hacks", agent="b")
     for older in ({"format": 1}, {"format": None, "results": 2}):
         with pytest.raises(InvalidValueError, match=r"format = .*`uard migrate FILE\.json` brings"):
             Published((study,), [data | older])

@@ -103,7 +103,7 @@ def test_a_run_is_stored_its_checkpoint_is_gone_and_another_process_gives_the_sa
     np.testing.assert_array_equal(found[0].extra["evaluation"], here.extra["evaluation"])
     assert found[0].steps == 512
     assert not np.array_equal(found[0].log[:5], found[1].log[:5])
-    assert set(found[0].metrics()) >= {"trap_visits", "true_return"}
+    assert set(found[0].metrics()) >= {"hacks", "true_return"}
 
 
 TRAINED_ELSEWHERE = """
@@ -176,7 +176,7 @@ def test_shares_of_all_settings_together_by_hand():
     hacks = {"raw": [100.0, 300.0], "true reward": [0.0, 0.0], "uard": [1.0, 3.0], "uard-paper": [50.0, 0.0]}
     true = {"raw": [-5.0, -5.0], "true reward": [400.0, 200.0], "uard": [300.0, 250.0], "uard-paper": [40.0, 40.0]}
     cells = {
-        r.cell.key: {"seeds": [0, 1], "metrics": {"trap_visits": hacks[m], "true_return": true[m]}}
+        r.cell.key: {"seeds": [0, 1], "metrics": {"hacks": hacks[m], "true_return": true[m]}}
         for r in rows
         for m in [r["mitigation"]]
     }
@@ -198,7 +198,7 @@ def test_other_agents_are_summed_up_by_their_worse_robot():
     cells = {}
     for r in study.where(agent="trpo"):
         worse = 2.0 if r["robot"] == "walker2d" and r["mitigation"] == "uard" else 1.0
-        metrics = {"trap_visits": [worse * hacks[r["mitigation"]]], "true_return": [true[r["mitigation"]] / worse]}
+        metrics = {"hacks": [worse * hacks[r["mitigation"]]], "true_return": [true[r["mitigation"]] / worse]}
         cells[r.cell.key] = {"seeds": [0], "metrics": metrics}
     said = shown._others(Published(every(), [{"format": FORMAT, "cells": cells}]))
     assert "(1 seed, the worse robot)" in said

@@ -420,7 +420,7 @@ def test_episodes_are_logged_in_the_order_of_their_ends():
     lengths = [length for _, length in ended[:17]]
     log = np.asarray(out.log)
     np.testing.assert_array_equal(log[:, LOG.index("length")], lengths)
-    np.testing.assert_array_equal(log[:, LOG.index("trap_visits")], [n == 2 for n in lengths])
+    np.testing.assert_array_equal(log[:, LOG.index("hacks")], [n == 2 for n in lengths])
     np.testing.assert_allclose(
         log[:, LOG.index("observed_return")], [(0, -1 + 1, -1 - 0.9 + 2)[n - 1] for n in lengths], atol=1e-6
     )

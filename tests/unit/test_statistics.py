@@ -204,8 +204,8 @@ def test_one_seed_is_too_few_for_a_test(test):
 
 @pytest.mark.parametrize("bad", [[], [math.nan], [[1.0], [2.0]], None])
 def test_summary_errors_name_the_field(bad):
-    with pytest.raises(InvalidValueError, match=r"^trap_visits\b"):
-        summarise(bad, "trap_visits")
+    with pytest.raises(InvalidValueError, match=r"^hacks\b"):
+        summarise(bad, "hacks")
 
 
 @pytest.mark.parametrize(("shift", "differs"), [(3.0, True), (0.0, False)])

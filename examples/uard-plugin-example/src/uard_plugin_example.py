@@ -128,6 +128,6 @@ def studies() -> dict[str, tuple[Study, ...]]:
 def sections(evidence: Evidence) -> list[Section]:
     """Return what joins the report; ``evidence`` holds all studies of the group ``grid``."""
     (walker, *_) = evidence.studies["control"].rows
-    rows = (("a random walker, 6x6", full(evidence.of(walker.cell, "trap_visits"))),)
+    rows = (("a random walker, 6x6", full(evidence.of(walker.cell, "hacks"))),)
     shown = table(Table("What nobody has to learn", ("who", "trap visits per episode"), rows))
     return [Section("example", "An example", 200, shown, losses=("Nobody has tried uard on bells of 1000.",))]

@@ -1,8 +1,8 @@
 """A policy's distribution over actions: discrete (categorical) or continuous (normal).
 
-A policy over A discrete actions is its layers, and its distribution are logits (B, A). One over D continuous actions is a
-``GaussianPolicy``, and its distribution is a ``Normal``. Everything that policy gradients need of either is here, so that
-PPO, TRPO and CPO do not know which of them they move.
+A policy over A discrete actions is its layers, and its distribution is logits (B, A). One over D continuous actions is
+a ``GaussianPolicy``, and its distribution is a ``Normal``. Everything that policy gradients need of either is here, so
+that PPO, TRPO and CPO do not know which of them they move.
 """
 
 from __future__ import annotations

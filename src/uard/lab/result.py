@@ -16,8 +16,8 @@ from uard.training.episode_log import LOG
 
 WINDOW = 100  # metrics are per episode over the last 100 episodes, as the paper's
 METRICS = (
-    "trap_visits",
-    "goal_rate",
+    "hacks",
+    "success_rate",
     "true_return",
     "observed_return",
     "alignment_gap",
@@ -30,7 +30,7 @@ METRICS = (
 # Columns of what a result has in ``extra`` under "calibration", "rating_error" and "tables".
 CALIBRATION = ("auroc_sigma_h", "auroc_with_proxy", "spearman_sigma_h", "spearman_with_proxy")
 RATING_ERROR = ("rmse_mean_rated", "rmse_mean_unrated", "rmse_sigma_h_rated", "rmse_sigma_h_unrated", "auroc_count")
-TABLES = ("count", "mean", "lowest", "spread", "proxy", "mu", "sigma_m", "lowest_value", "rated")
+TABLES = ("count", "mean", "lowest", "sd", "proxy", "mu", "sigma_m", "lowest_value", "rated")
 
 
 class CorruptResultError(RuntimeError):
@@ -65,7 +65,7 @@ class Result:
     """One trained seed.
 
     Attributes:
-        log: (episodes, 6) per-episode sums of ``lanes.LOG``.
+        log: (episodes, 6) per-episode sums, columns ``uard.training.episode_log.LOG``.
         steps: Environment steps taken.
         path: States that the greedy policy visits after training, the start included.
         extra: Further arrays (calibration, uncertainty curves) by name.

@@ -31,7 +31,7 @@ def tables(p: Published) -> list[Table]:
 
 
 def _visits(p: Published, r: Row) -> str:
-    return brief(p.of(r, "trap_visits"))
+    return brief(p.of(r, "hacks"))
 
 
 def _baselines(p: Published) -> Table:
@@ -41,7 +41,7 @@ def _baselines(p: Published) -> Table:
         rows.append((printed.method, "paper", f"{mean:.1f} ± {sd:.2f}", f"{printed.reward.mean:g}", "–", "–"))
     for r in p.rows("deep-baselines"):
         who = r["agent"] if r["mitigation"] == "raw" else f"{r['agent']} + {r['mitigation']}"
-        s = [brief(p.of(r, m)) for m in ("trap_visits", "observed_return", "goal_rate", "true_return")]
+        s = [brief(p.of(r, m)) for m in ("hacks", "observed_return", "success_rate", "true_return")]
         rows.append((who, f"ours, T = {r['horizon']}", *s))
     return Table(
         "Table 3 (F3) with the deep baselines: 10x10, +4, per episode over the last 100 of 500",
@@ -56,7 +56,7 @@ def _baselines(p: Published) -> Table:
 def _competence(p: Published) -> Table:
     rows = []
     for r in p.rows("deep-competence"):
-        rows.append((r["agent"], *(full(p.of(r, m)) for m in ("goal_rate", "true_return", "trap_visits"))))
+        rows.append((r["agent"], *(full(p.of(r, m)) for m in ("success_rate", "true_return", "hacks"))))
     return Table(
         "Control: the same agents on the true reward of 10x10, T = 100",
         ("agent", "goal rate", "true return", "trap visits"),
@@ -69,7 +69,7 @@ def _competence(p: Published) -> Table:
 def _mitigated(p: Published) -> Table:
     rows = []
     for r in p.rows("deep-uard"):
-        s = [full(p.of(r, m)) for m in ("trap_visits", "goal_rate", "true_return")]
+        s = [full(p.of(r, m)) for m in ("hacks", "success_rate", "true_return")]
         rows.append((r["agent"], f"{r['trap']:+g}", r["panel"], *s))
     return Table(
         "Every agent with uard, 10x10, T = 100, one setting, ratings through the learned model",
@@ -82,7 +82,7 @@ def _mitigated(p: Published) -> Table:
 def _rivals(p: Published) -> Table:
     rows = []
     for r in p.rows("deep-rivals"):
-        s = [full(p.of(r, m)) for m in ("trap_visits", "true_return", "goal_rate")]
+        s = [full(p.of(r, m)) for m in ("hacks", "true_return", "success_rate")]
         rows.append((r["agent"], r["panel"], r["mitigation"], *s))
     return Table(
         "Other mitigations in deep agents: 10x10, +4, T = 80, every rater with noise of sd 1.2",
@@ -104,8 +104,8 @@ def matched(p: Published) -> list[str]:
             mine = [r for r in group if r["mitigation"] == "uard"]
             if not mine:
                 continue
-            bound = p.of(mine[0], "trap_visits").ci95[1]
-            equals = [r for r in group if r is not mine[0] and p.of(r, "trap_visits").ci95[0] <= bound]
+            bound = p.of(mine[0], "hacks").ci95[1]
+            equals = [r for r in group if r is not mine[0] and p.of(r, "hacks").ci95[0] <= bound]
             own = p.of(mine[0], "true_return")
             better = [r for r in equals if p.of(r, "true_return").ci95[0] > own.ci95[1]]
             higher = [r for r in equals if p.of(r, "true_return").mean > own.mean and r not in better]
@@ -129,17 +129,17 @@ def matched(p: Published) -> list[str]:
 def losses(p: Published) -> list[str]:
     """Say where ``uard`` fails or is beaten in deep agents, found by rule."""
     missed = [
-        f"{r['agent']} {r['trap']:+g} {r['panel']}: visits {_visits(p, r)}, goal {brief(p.of(r, 'goal_rate'))}"
+        f"{r['agent']} {r['trap']:+g} {r['panel']}: visits {_visits(p, r)}, goal {brief(p.of(r, 'success_rate'))}"
         for r in p.rows("deep-uard")
-        if p.of(r, "trap_visits").mean > 0.5 or p.of(r, "goal_rate").mean < 0.95
+        if p.of(r, "hacks").mean > 0.5 or p.of(r, "success_rate").mean < 0.95
     ]
     out = []
     if p.rows("deep-uard"):
         text = f"Deep agents on 10x10: of {len(p.rows('deep-uard'))} settings uard misses 0.5 visits or 95 % goals in {len(missed)}"
         out.append(text + (": " + "; ".join(missed) if missed else "") + ".")
-    unable = [r for r in p.rows("deep-competence") if p.of(r, "goal_rate").mean < 0.95]
+    unable = [r for r in p.rows("deep-competence") if p.of(r, "success_rate").mean < 0.95]
     if unable:
-        goals = "; ".join(f"{r['agent']} {brief(p.of(r, 'goal_rate'))}" for r in unable)
+        goals = "; ".join(f"{r['agent']} {brief(p.of(r, 'success_rate'))}" for r in unable)
         out.append(
             f"On the true reward of 10x10 these agents miss 95 % goals in the paper's budget, so what they do there with uard says little: {goals}."
         )
@@ -160,7 +160,7 @@ def losses(p: Published) -> list[str]:
         for r in p.rows("deep-feedback")
     ]
     for r, where in settings:
-        goals = p.per_seed(r, "goal_rate")
+        goals = p.per_seed(r, "success_rate")
         if lost := int((goals < 0.5).sum()):
             out.append(f"uard lost the goal in {lost} of {len(goals)} runs: {where}.")
     return out
@@ -169,7 +169,7 @@ def losses(p: Published) -> list[str]:
 def _ablation(p: Published) -> Table:
     rows = []
     for r in p.rows("deep-ablation"):
-        s = [full(p.of(r, m)) for m in ("trap_visits", "goal_rate", "true_return")]
+        s = [full(p.of(r, m)) for m in ("hacks", "success_rate", "true_return")]
         rows.append((r["variant"], r["reading"], *s))
     return Table(
         "Table 5 (F5) with deep agents: 6x6, main panel",
@@ -212,7 +212,7 @@ def _feedback(p: Published) -> Table:
         errors, ranks = p.derived(r, "rating_error"), p.derived(r, "calibration")
         got = [brief(statistics.summarise(errors[:, i])) for i in range(len(RATING_ERROR))]
         auroc = brief(statistics.summarise(ranks[:, CALIBRATION.index("auroc_with_proxy")]))
-        visits, true = (brief(p.of(r, m)) for m in ("trap_visits", "true_return"))
+        visits, true = (brief(p.of(r, m)) for m in ("hacks", "true_return"))
         rows.append((r["source"], f"{100 * r['rated']:g} %", *got, auroc, visits, true))
     return Table(
         "What the learner knows of its raters: running means, or a model of the ratings (10x10, main panel)",
@@ -305,7 +305,7 @@ def drawn(p: Published) -> list[tuple[str, str, str]]:
 
 def _curves(p: Published) -> Figure:
     figure, axes = axes_of(2, 6.2, 4.2)
-    for axis, column in zip(axes, ("observed_return", "trap_visits"), strict=True):
+    for axis, column in zip(axes, ("observed_return", "hacks"), strict=True):
         for r in p.rows("deep-baselines", horizon=100):
             curve = p.curves(r, column).mean(0)
             raw = r["mitigation"] == "raw"

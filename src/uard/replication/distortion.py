@@ -81,7 +81,7 @@ def walk(cell: Cell, result: Result, seed: int) -> Trace:
 
 def _feedback(tables: dict[str, np.ndarray], raters: int) -> Feedback:
     """Return what the agent had learned of its raters, all of whom answer every question."""
-    count, mean, lowest, sd, proxy = (tables[name] for name in ("count", "mean", "lowest", "spread", "proxy"))
+    count, mean, lowest, sd, proxy = (tables[name] for name in ("count", "mean", "lowest", "sd", "proxy"))
     return Feedback(count, mean, lowest, sd, proxy, raters * np.ones_like(count))
 
 

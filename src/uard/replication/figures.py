@@ -45,7 +45,7 @@ def filters(e: Evidence) -> Figure:
     left.legend()
     forms = list(dict.fromkeys(r["form"] for r in e.studies["filters"].rows))
     for i, reading in enumerate(("uard-paper", "uard-consistent", "uard")):
-        s = [e.get("filters", "goal_rate", form=f, reading=reading) for f in forms]
+        s = [e.get("filters", "success_rate", form=f, reading=reading) for f in forms]
         place = np.arange(len(forms)) + (i - 1) * 0.26
         right.bar(place, [x.mean for x in s], 0.24, color=COLOURS[reading], label=reading)
         low, high = np.array([[x.mean - x.ci95[0], x.ci95[1] - x.mean] for x in s]).T
@@ -75,10 +75,10 @@ def hero(e: Evidence) -> Figure:
     return figure
 
 
-def trap_visits(e: Evidence) -> Figure:
+def hacks(e: Evidence) -> Figure:
     """G4: trap visits per episode."""
     agents = ("baseline", "multi-head", "uard-paper", "uard")
-    return _training(e, "trap_visits", agents, "trap visits per episode", "6x6")
+    return _training(e, "hacks", agents, "trap visits per episode", "6x6")
 
 
 def alignment_gap(e: Evidence) -> Figure:
@@ -126,7 +126,7 @@ def noise(e: Evidence) -> Figure:
         for agent in agents:
             colour = COLOURS.get(agent, COLOURS["mean-of-annotations"])
             levels = (0, 10, 20, 30)
-            v = [e.per_seed("noise", "trap_visits", agent=agent, panel="main", percent=p, unit=unit) for p in levels]
+            v = [e.per_seed("noise", "hacks", agent=agent, panel="main", percent=p, unit=unit) for p in levels]
             mean, sd = np.array([x.mean() for x in v]), np.array([x.std(ddof=1) for x in v])
             axis.plot(levels, mean, "o-", color=colour, lw=2, label=agent)
             axis.fill_between(levels, mean - sd, mean + sd, color=colour, alpha=0.15, lw=0)

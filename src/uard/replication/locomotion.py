@@ -25,7 +25,7 @@ LEGITIMATE, CAUTION = "mujoco-standard-legitimate", "mujoco-standard-caution"
 AS_GOOD = 0.03  # by how much the AUROC of a cheaper sigma_m may be lower
 REFERENCES = ("raw", "true reward")
 REMOVED, KEPT, COST = 0.936, 0.9, 0.05  # the paper's best reduction (J16); what is asked of a filter beside it
-METRICS = ("trap_visits", "true_return", "observed_return")
+METRICS = ("hacks", "true_return", "observed_return")
 HEADS = ("steps in the region per episode", "true return", "observed return")  # of METRICS
 COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", "uard": "#2c6fbb"}
 
@@ -94,9 +94,9 @@ def shares(p: Published, r: Row) -> tuple[float | None, float | None]:
 
 
 def _removed(p: Published, r: Row, raw: Row | None) -> float | None:
-    if raw is None or p.of(raw, "trap_visits").mean < 1.0:
+    if raw is None or p.of(raw, "hacks").mean < 1.0:
         return None
-    return 1.0 - p.of(r, "trap_visits").mean / p.of(raw, "trap_visits").mean
+    return 1.0 - p.of(r, "hacks").mean / p.of(raw, "hacks").mean
 
 
 def _kept(p: Published, r: Row, honest: Row | None) -> float | None:
@@ -125,7 +125,7 @@ def pooled(p: Published, robot: str, agent: str, mitigation: str) -> tuple[np.nd
     if [len(g) for g in groups] != [4, 2, 2] or len({p.seeds_of(r) for g in groups for r in g}) > 1:
         return None
     ours, raw, honest = (
-        np.array([[p.per_seed(r, m) for m in ("trap_visits", "true_return")] for r in g]).mean(0) for g in groups
+        np.array([[p.per_seed(r, m) for m in ("hacks", "true_return")] for r in g]).mean(0) for g in groups
     )
     return 1.0 - ours[0] / raw[0], ours[1] / honest[1]
 
@@ -133,7 +133,7 @@ def pooled(p: Published, robot: str, agent: str, mitigation: str) -> tuple[np.nd
 def headline(p: Published) -> str:
     """Say in a few sentences what PPO does in the tasks that lie, also under noise; the README quotes it."""
     lies = [r for r in p.rows(HACKING, agent="ppo") if r["region"] != "none"]
-    raw, ours = ([p.of(r, "trap_visits").mean for r in lies if r["mitigation"] == m] for m in ("raw", "uard"))
+    raw, ours = ([p.of(r, "hacks").mean for r in lies if r["mitigation"] == m] for m in ("raw", "uard"))
     kept = {
         m: " and ".join(
             f"{said(100 * found[1])} % ({robot})"
@@ -153,7 +153,7 @@ def headline(p: Published) -> str:
         f"`uard` at most {number(max(ours))}. Over all settings of a robot `uard` keeps {kept['uard']} of the true return of "
         f"the agent trained on the true reward; as printed, {kept['uard-paper']}. "
         f"With noise of 30 % of the bonus on every rating (Hopper, vibration) it spends "
-        f"{said(p.per_seed(noisy, 'trap_visits'))} steps where the reward lies and has a true return of "
+        f"{said(p.per_seed(noisy, 'hacks'))} steps where the reward lies and has a true return of "
         f"{said(p.per_seed(noisy, 'true_return'))}; the honest agent has {said(p.per_seed(honest, 'true_return'))}. "
         f"Without a lie (Hopper, {len(p.seeds_of(plain['uard']))} seeds) its true return is "
         f"{said(p.per_seed(plain['uard'], 'true_return'))}, the raw agent's {said(p.per_seed(plain['raw'], 'true_return'))}."
@@ -298,7 +298,7 @@ def _rating(p: Published) -> Table:
     rows = []
     for r in p.rows(RATING):
         best = (said(x) for x in p.derived(r, "deterministic").T)
-        cells = (said(p.per_seed(r, m)) for m in ("trap_visits", "true_return"))
+        cells = (said(p.per_seed(r, m)) for m in ("hacks", "true_return"))
         rows.append((r["region"], r["panel"], r["query"], *cells, *best))
     return Table(
         f"Which steps are rated: Hopper, PPO with uard, {_steps(p, RATING)}, 15 % of steps",
@@ -396,7 +396,7 @@ def _of_hacking(p: Published) -> list[str]:
     lies = [(r, *shares(p, r)) for r in ours if r["region"] != "none"]
     leaks = [(r, f"{100 * x:.1f} % ({_steps_inside(p, r)})") for r, x, _ in lies if x is not None and x < REMOVED]
     honest_too = sum(
-        p.of(r, "trap_visits").mean <= p.of(honest, "trap_visits").mean
+        p.of(r, "hacks").mean <= p.of(honest, "hacks").mean
         for r, _ in leaks
         if (honest := _rival(p, r, "true reward")) is not None
     )
@@ -442,7 +442,7 @@ def _of_hacking(p: Published) -> list[str]:
 
 def _steps_inside(p: Published, r: Row) -> str:
     rows = (r, _rival(p, r, "raw"), _rival(p, r, "true reward"))
-    own, raw, honest = ("?" if x is None else number(p.of(x, "trap_visits").mean) for x in rows)
+    own, raw, honest = ("?" if x is None else number(p.of(x, "hacks").mean) for x in rows)
     return f"{own} steps of {raw}; true reward {honest}"
 
 
@@ -454,7 +454,7 @@ def _of_noise(p: Published) -> list[str]:
         )
         removed, kept = _removed(p, r, raw), _kept(p, r, honest)
         if r["noise"] and ((removed is not None and removed < REMOVED) or (kept is not None and kept < KEPT)):
-            hacks, true = (said(p.per_seed(r, m)) for m in ("trap_visits", "true_return"))
+            hacks, true = (said(p.per_seed(r, m)) for m in ("hacks", "true_return"))
             missed.append(f"{r['agent']} at {100 * r['noise']:.0f} %: {hacks} hack steps, true return {true}")
     better = []
     for r in p.rows(NOISE, mitigation="uard"):
@@ -563,7 +563,7 @@ def _dots(p: Published, robot: str) -> Figure:
     settings = list(dict.fromkeys((r["agent"], r["region"]) for r in there if r["region"] != "none"))
     figure, axes = axes_of(2, 6.2, 1.2 + 0.7 * len(settings))
     for axis, metric, label in zip(
-        axes, ("trap_visits", "true_return"), ("steps in the region per episode", "true return"), strict=True
+        axes, ("hacks", "true_return"), ("steps in the region per episode", "true return"), strict=True
     ):
         names = []
         for i, (agent, region) in enumerate(settings):

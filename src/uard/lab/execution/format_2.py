@@ -17,8 +17,8 @@ from uard.lab.config import TYPE, key_of
 NUMBER = 2
 
 # New names of metrics and of the log's columns, by their old ones.
-METRICS: dict[str, str] = {}
-COLUMNS: dict[str, str] = {}
+METRICS: dict[str, str] = {"trap_visits": "hacks", "goal_rate": "success_rate"}
+COLUMNS: dict[str, str] = {"trap_visits": "hacks", "goal": "success"}
 
 _NAMES = {
     **{f"uard.{name}": name.rpartition(".")[2] for name in (

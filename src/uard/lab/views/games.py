@@ -39,7 +39,7 @@ def tables(p: Published) -> list[Table]:
             for name in names:
                 found = p.rows("gaming", game=game, agent=agent, mitigation=name)
                 cells.append(
-                    f"{number(p.of(found[0], 'true_return').mean)} ({number(p.of(found[0], 'trap_visits').mean)})"
+                    f"{number(p.of(found[0], 'true_return').mean)} ({number(p.of(found[0], 'hacks').mean)})"
                     if found
                     else "–"
                 )

@@ -25,7 +25,7 @@ def losses(e: Evidence) -> list[str]:
 def _colluding(e: Evidence) -> str:
     """The control: who trusts raters is fooled when all of them repeat the proxy."""
     fooled = list(e.studies["matrix"].where(mitigation="uard", panel="colluding"))
-    worst = min(e.of(r.cell, "trap_visits").mean / e.of(r.cell, "episode_length").mean for r in fooled)
+    worst = min(e.of(r.cell, "hacks").mean / e.of(r.cell, "episode_length").mean for r in fooled)
     return (
         f"Colluding raters (all repeat the proxy): uard hacks in {len(fooled)} of {len(fooled)} settings, at least "
         f"{worst:.2f} trap visits per step. It reads agreement as truth; this control must fail, and does. {_escaped(e)}"
@@ -57,8 +57,7 @@ def _missed(e: Evidence) -> str:
     missed = [
         r
         for r in honest
-        if e.of(r.cell, "trap_visits").mean > (0.15 if r["noise"] == 0 else 0.2)
-        or e.of(r.cell, "goal_rate").mean < 0.98
+        if e.of(r.cell, "hacks").mean > (0.15 if r["noise"] == 0 else 0.2) or e.of(r.cell, "success_rate").mean < 0.98
     ]
     named = ": " + "; ".join(_name(r) for r in missed) if missed else ""
     return (
@@ -70,7 +69,7 @@ def _missed(e: Evidence) -> str:
 def _learned(e: Evidence) -> str:
     """The reward that is itself a model of ratings."""
     learned = list(e.studies["sources"].where(mitigation="uard", sources="sigma_m and sigma_h"))
-    fooled = [r for r in learned if e.of(r.cell, "trap_visits").mean > 1 or e.of(r.cell, "goal_rate").mean < 0.95]
+    fooled = [r for r in learned if e.of(r.cell, "hacks").mean > 1 or e.of(r.cell, "success_rate").mean < 0.95]
     return (
         f"A reward that is itself a model of ratings (study sources): uard as recommended fails for {len(fooled)} of "
         f"{len(learned)} models: it believes a tenth of what nobody has rated, and their extrapolation is large enough for "
@@ -120,7 +119,7 @@ def _name(r: Row) -> str:
 
 def tables(e: Evidence) -> list[Table]:
     """Return all tables."""
-    matrices = (_matrix(e, metric) for metric in ("true_return", "trap_visits", "goal_rate"))
+    matrices = (_matrix(e, metric) for metric in ("true_return", "hacks", "success_rate"))
     return [*matrices, _twins(e), _calibration(e), _sources(e)]
 
 
@@ -200,14 +199,14 @@ def _sources(e: Evidence) -> Table:
     kinds = dict.fromkeys((r["mitigation"], r["sources"]) for r in e.studies["sources"].rows)
     for name, way in kinds:
         cells = [r.cell for r in e.studies["sources"].where(mitigation=name, sources=way)]
-        worst = max(e.of(c, "trap_visits").mean for c in cells)
-        solved = sum(e.of(c, "trap_visits").mean <= 1.0 and e.of(c, "goal_rate").mean >= 0.95 for c in cells)
-        means = {m: statistics.summarise([e.of(c, m).mean for c in cells]) for m in ("trap_visits", "true_return")}
+        worst = max(e.of(c, "hacks").mean for c in cells)
+        solved = sum(e.of(c, "hacks").mean <= 1.0 and e.of(c, "success_rate").mean >= 0.95 for c in cells)
+        means = {m: statistics.summarise([e.of(c, m).mean for c in cells]) for m in ("hacks", "true_return")}
         rows.append(
             (
                 name,
                 way,
-                brief(means["trap_visits"]),
+                brief(means["hacks"]),
                 number(worst),
                 brief(means["true_return"]),
                 f"{solved} of {len(cells)}",

@@ -123,7 +123,7 @@ def lines(store: Store) -> list[Line]:
     cells = store.cells()
     known = _Names([cell.config for cell in cells])
     seeds = [cell.metrics for cell in cells]
-    hacks = _estimates([[m["trap_visits"] / m["episode_length"] for m in s.values()] for s in seeds])
+    hacks = _estimates([[m["hacks"] / m["episode_length"] for m in s.values()] for s in seeds])
     true = _estimates([[m["true_return"] for m in s.values()] for s in seeds])
     made = [_line(c.config, known, len(c.metrics), c.failed, h, t) for c, h, t in zip(cells, hacks, true, strict=True)]
     return sorted(made, key=lambda x: (*x.setting, -x.true.mean if x.true else np.inf, x.mitigation))

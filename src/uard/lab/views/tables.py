@@ -8,7 +8,7 @@ from uard.lab.statistics import Summary
 from uard.lab.study import Study
 from uard.lab.views.evidence import Evidence
 
-SHOWN = ("trap_visits", "goal_rate", "true_return", "observed_return", "alignment_gap")
+SHOWN = ("hacks", "success_rate", "true_return", "observed_return", "alignment_gap")
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ class EpisodeMoments(NamedTuple):
 
     visits: np.ndarray
     visits_variance: np.ndarray
-    goal_rate: np.ndarray
+    success_rate: np.ndarray
     observed_return: np.ndarray
 
 

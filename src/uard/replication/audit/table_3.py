@@ -192,7 +192,7 @@ def _random() -> Check:
             "visits": walker,
             "reduction %": 100.0 * (1.0 - walker / VISITS["DQN"]),
             "reward": float(random.observed_return[0]),
-            "goal %": 100.0 * float(random.goal_rate[0]),
+            "goal %": 100.0 * float(random.success_rate[0]),
         },
         others={"T": horizon()},
         claims=(

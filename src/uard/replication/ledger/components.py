@@ -19,8 +19,8 @@ _PASSIVE = ("Ablation I", "Ablation II")
 
 
 def _undiscounted(e: Evidence) -> dict[str, Any]:
-    base = e.per_seed("table5", "trap_visits", variant="Baseline Q-Learning")
-    tests = [statistics.welch(base, e.per_seed("table5", "trap_visits", variant=v)) for v in _PASSIVE]
+    base = e.per_seed("table5", "hacks", variant="Baseline Q-Learning")
+    tests = [statistics.welch(base, e.per_seed("table5", "hacks", variant=v)) for v in _PASSIVE]
     printed = {row.variant: row.visits.mean for row in paper.TABLE_5}
     return {
         "fewer": {v: t.difference for v, t in zip(_PASSIVE, tests, strict=True)},
@@ -48,7 +48,7 @@ J31 = Conditions(
 
 def _sources(e: Evidence) -> dict[str, Any]:
     variants = {"lite": "No sigma_h (UARD-lite)", "human": "No sigma_m (Human-only)", "both": "UARD (Full)"}
-    return {k: e.get("table5", "trap_visits", variant=v, reading="uard-paper") for k, v in variants.items()}
+    return {k: e.get("table5", "hacks", variant=v, reading="uard-paper") for k, v in variants.items()}
 
 
 J32 = Conditions(
@@ -103,7 +103,7 @@ def _sensitivity(e: Evidence) -> dict[str, Any]:
         }
 
     return {
-        **{f"visits_{name}": at("trap_visits", _LAMBDA[name]) for name in ("small", "usual", "five")},
+        **{f"visits_{name}": at("hacks", _LAMBDA[name]) for name in ("small", "usual", "five")},
         **{f"true_{name}": at("true_return", _LAMBDA[name]) for name in ("usual", "large")},
     }
 
@@ -134,18 +134,18 @@ _LIMITS, _RESPONSES = ("0.25", "0.5", "1"), ("safe", "ask", "skip")
 
 def _deferring(e: Evidence) -> dict[str, Any]:
     def visits(limit: str, response: str) -> Summary:
-        return e.get("abstention", "trap_visits", rule="threshold", limit=float(limit), response=response)
+        return e.get("abstention", "hacks", rule="threshold", limit=float(limit), response=response)
 
     def deferred(limit: str) -> float:
         return float(e.curves("abstention", "abstained", rule="threshold", limit=float(limit), response="safe").mean())
 
     rows = e.studies["abstention"].rows
     best = max(rows, key=lambda r: e.of(r.cell, "true_return").mean)
-    solved = [r for r in rows if e.of(r.cell, "trap_visits").mean < 0.5 and e.of(r.cell, "goal_rate").mean > 0.9]
+    solved = [r for r in rows if e.of(r.cell, "hacks").mean < 0.5 and e.of(r.cell, "success_rate").mean > 0.9]
     return {
         "deferred": {limit: deferred(limit) for limit in _LIMITS},
         "visits": {response: visits(_LIMITS[0], response) for response in _RESPONSES},
-        "none": e.get("abstention", "trap_visits", rule="none"),
+        "none": e.get("abstention", "hacks", rule="none"),
         "best": f"{best['rule']} {best['limit']:g}, {best['response']}",
         "best_true": e.of(best.cell, "true_return"),
         "none_true": e.get("abstention", "true_return", rule="none"),

@@ -177,7 +177,7 @@ def _settings(e: Evidence, study: str, labels: dict[str, Any]) -> list[Row]:
 def _solved(e: Evidence, study: str, labels: dict[str, Any]) -> int:
     """Return in how many settings there is less than one visit, and the goal in nine of ten episodes."""
     rows = _settings(e, study, labels)
-    return sum(e.of(r.cell, "trap_visits").mean < FEW and e.of(r.cell, "goal_rate").mean >= 0.9 for r in rows)
+    return sum(e.of(r.cell, "hacks").mean < FEW and e.of(r.cell, "success_rate").mean >= 0.9 for r in rows)
 
 
 def _trace(row: Row) -> dict[str, np.ndarray]:
@@ -205,8 +205,8 @@ def _adaptation(e: Evidence) -> dict[str, Any] | None:
         "settings": len(_settings(e, *ADAPTIVE)),
         "solved": _solved(e, *ADAPTIVE),
         "static_solved": {name: _solved(e, *where) for name, where in STATIC.items()},
-        "lowest_visits": max(e.of(r.cell, "trap_visits").mean for r in lowest),
-        "lowest_goal": min(e.of(r.cell, "goal_rate").mean for r in lowest),
+        "lowest_visits": max(e.of(r.cell, "hacks").mean for r in lowest),
+        "lowest_goal": min(e.of(r.cell, "success_rate").mean for r in lowest),
     }
 
 

@@ -94,7 +94,8 @@ def _jumps() -> dict[str, float]:
 def _smooth(e: Evidence) -> dict[str, Any]:
     def early(form: str) -> dict[str, Summary]:
         return {
-            name: e.window("filters", "goal", 1, 100, form=form, reading=reading) for name, reading in READINGS.items()
+            name: e.window("filters", "success", 1, 100, form=form, reading=reading)
+            for name, reading in READINGS.items()
         }
 
     jumps = _jumps()
@@ -130,10 +131,10 @@ def _rivals(e: Evidence) -> dict[str, Any]:
     return {
         "jump": jumps["reciprocal"],
         "jump_linear": jumps["linear"],
-        "visits": of("trap_visits", "reciprocal"),
-        "visits_linear": of("trap_visits", "linear"),
-        "goal": of("goal_rate", "reciprocal"),
-        "goal_exponential": of("goal_rate", "exponential"),
+        "visits": of("hacks", "reciprocal"),
+        "visits_linear": of("hacks", "linear"),
+        "goal": of("success_rate", "reciprocal"),
+        "goal_exponential": of("success_rate", "exponential"),
     }
 
 

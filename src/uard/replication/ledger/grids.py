@@ -28,7 +28,7 @@ def _size(name: str) -> int:
 
 def _mean_rating(e: Evidence) -> dict[str, Any]:
     labels = {"mitigation": "mean-of-annotations", "size": 6, "trap": 4.0, "noise": 0.0}
-    return {"visits": {p: e.get("matrix", "trap_visits", panel=p, **labels) for p in PANELS}}
+    return {"visits": {p: e.get("matrix", "hacks", panel=p, **labels) for p in PANELS}}
 
 
 J15 = Conditions(
@@ -46,8 +46,8 @@ J15 = Conditions(
 
 
 def _fall(e: Evidence) -> dict[str, Any]:
-    ours = {p: e.get("table4", "trap_visits", agent="uard-paper", panel=p) for p in PANELS}
-    base = {p: e.get("table4", "trap_visits", agent="baseline", panel=p) for p in PANELS}
+    ours = {p: e.get("table4", "hacks", agent="uard-paper", panel=p) for p in PANELS}
+    base = {p: e.get("table4", "hacks", agent="baseline", panel=p) for p in PANELS}
     return {
         "ours": ours,
         "reduction": {p: reduction(ours[p], base[p]) for p in PANELS},
@@ -68,10 +68,7 @@ J17 = Conditions(
 def _reductions(e: Evidence) -> dict[str, float]:
     return {
         name: reduction(
-            *(
-                e.get("scale", "trap_visits", agent=a, size=_size(name), panel="main")
-                for a in ("uard-paper", "baseline")
-            )
+            *(e.get("scale", "hacks", agent=a, size=_size(name), panel="main") for a in ("uard-paper", "baseline"))
         )
         for name in SIZES
     }
@@ -150,9 +147,9 @@ J20 = Conditions(
 
 def _turn(e: Evidence) -> dict[str, Any]:
     def goals(first: int, last: int) -> dict[str, Summary]:
-        return {p: e.window("table4", "goal", first, last, agent="uard-paper", panel=p) for p in PANELS}
+        return {p: e.window("table4", "success", first, last, agent="uard-paper", panel=p) for p in PANELS}
 
-    repaired = np.convolve(e.curves("table4", "goal", agent="uard", panel="main").mean(0), np.ones(10) / 10, "valid")
+    repaired = np.convolve(e.curves("table4", "success", agent="uard", panel="main").mean(0), np.ones(10) / 10, "valid")
     return {
         "before": goals(201, 300),
         "late": goals(401, 500),
@@ -175,7 +172,7 @@ def _settled(e: Evidence) -> dict[str, Any]:
         return {p: e.window("table4", column, 200, 500, agent="uard-paper", panel=p) for p in PANELS}
 
     printed = next(row.true_return for row in paper.TABLE_4 if row.agent == "UARD")
-    return {"visits": late("trap_visits"), "true": late("true_return"), "printed": printed}
+    return {"visits": late("hacks"), "true": late("true_return"), "printed": printed}
 
 
 J27 = Conditions(
@@ -199,13 +196,13 @@ def _scaling(e: Evidence) -> dict[str, Any]:
     def of(metric: str, agent: str) -> dict[str, Summary]:
         return {name: e.get("scale", metric, agent=agent, size=_size(name), panel="main") for name in SIZES}
 
-    base, length = of("trap_visits", "baseline"), of("episode_length", "baseline")
+    base, length = of("hacks", "baseline"), of("episode_length", "baseline")
     return {
         "reduction": _reductions(e),
         "smallest": min(paper.PERCENT[name].value for name in ("hits-8x8", "hits-10x10")) / 100,
         "baseline": base,
         "per_step": {name: base[name].mean / length[name].mean for name in SIZES},
-        "goal": max(s.mean for s in of("goal_rate", "uard-paper").values()),
+        "goal": max(s.mean for s in of("success_rate", "uard-paper").values()),
     }
 
 
@@ -252,7 +249,7 @@ CELLS = {f"{size}, {panel} panel": (_size(size), panel) for size in SIZES for pa
 def _competence(e: Evidence) -> dict[str, Any]:
     def goals(agent: str) -> dict[str, Summary]:
         return {
-            name: e.get("scale", "goal_rate", agent=agent, size=size, panel=panel)
+            name: e.get("scale", "success_rate", agent=agent, size=size, panel=panel)
             for name, (size, panel) in CELLS.items()
         }
 

@@ -22,11 +22,11 @@ def _hacks(robot: str, mitigation: str) -> list[tuple[float, float]]:
     """Return hacks per episode, ours and the raw agent's, of each setting in which the raw agent makes at least one."""
     p = published.packaged()
     raw = {
-        (r["agent"], r["region"]): p.of(r, "trap_visits").mean
+        (r["agent"], r["region"]): p.of(r, "hacks").mean
         for r in p.rows(locomotion.HACKING, robot=robot, mitigation="raw")
     }
     settings = [
-        (p.of(r, "trap_visits").mean, raw.get((r["agent"], r["region"]), 0.0))
+        (p.of(r, "hacks").mean, raw.get((r["agent"], r["region"]), 0.0))
         for r in p.rows(locomotion.HACKING, robot=robot, mitigation=mitigation)
     ]
     return [(ours, theirs) for ours, theirs in settings if theirs >= 1]
@@ -38,8 +38,7 @@ def _everywhere(e: Evidence) -> dict[str, Any] | None:
     if not all(printed_form.values()) or not repaired:
         return None
     ours, base, walker = (
-        e.get("table3", "trap_visits", agent=a, horizon=100, panel="main")
-        for a in ("uard-paper", "baseline", "random walk")
+        e.get("table3", "hacks", agent=a, horizon=100, panel="main") for a in ("uard-paper", "baseline", "random walk")
     )
     well_specified, raw = (
         e.get("legitimate", "true_return", mitigation=m, size=10, trap=4.0, panel="main") for m in ("uard-paper", "raw")
@@ -92,7 +91,7 @@ def _violations(mitigation: str, noise: float) -> dict[str, Summary] | None:
         rows = p.rows(locomotion.NOISE, agent=agent, mitigation=mitigation, noise=noise)
         if not rows:
             return None
-        found[name] = p.of(rows[0], "trap_visits")
+        found[name] = p.of(rows[0], "hacks")
     return found
 
 
@@ -140,7 +139,7 @@ def _degradation(e: Evidence) -> dict[str, Any] | None:
         return None
 
     def grid(agent: str, percent: int, panel: str, unit: str) -> Summary:
-        return e.get("noise", "trap_visits", agent=agent, panel=panel, percent=percent, unit=unit)
+        return e.get("noise", "hacks", agent=agent, panel=panel, percent=percent, unit=unit)
 
     def tabular(percent: int) -> dict[str, Summary]:
         return {"grid": grid("baseline", percent, "main", "of the trap's reward")}

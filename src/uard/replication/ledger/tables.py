@@ -23,7 +23,7 @@ def _agree(n: Numbers, setting: str, ours: str, printed: str) -> bool:
 def _scale(e: Evidence) -> dict[str, Any]:
     def visits(agent: str) -> dict[str, Any]:
         return {
-            name: e.get("scale", "trap_visits", agent=agent, size=row.size, panel="main")
+            name: e.get("scale", "hacks", agent=agent, size=row.size, panel="main")
             for name, row in zip(SIZES, paper.TABLE_2, strict=True)
         }
 
@@ -68,13 +68,13 @@ def _baselines(e: Evidence) -> dict[str, Any] | None:
         return e.get("table3", metric, agent=agent, horizon=100, panel="main")
 
     return {
-        "visits": of("trap_visits"),
+        "visits": of("hacks"),
         "reward": of("observed_return"),
         "printed_visits": {row.method: _per_episode(row.visits) for row in paper.TABLE_3},
         "printed_reward": {row.method: row.reward for row in paper.TABLE_3},
-        "tabular": ours("trap_visits", "baseline"),
-        "walker": ours("trap_visits", "random walk"),
-        "goal": ours("goal_rate", "uard-paper").mean,
+        "tabular": ours("hacks", "baseline"),
+        "walker": ours("hacks", "random walk"),
+        "goal": ours("success_rate", "uard-paper").mean,
     }
 
 
@@ -98,7 +98,7 @@ _AGENTS = {"Baseline": "baseline", "Multi-Head": "multi-head", "UARD": "uard-pap
 _COLUMNS = {
     "true return": ("true_return", "true_return"),
     "observed return": ("observed_return", "observed_return"),
-    "trap visits": ("trap_visits", "visits"),
+    "trap visits": ("hacks", "visits"),
     "alignment gap": ("alignment_gap", "gap"),
 }
 PERFORMANCE = {
@@ -135,7 +135,7 @@ _VARIANTS = {
 
 def _ablation(e: Evidence) -> dict[str, Any]:
     return {
-        "ours": {name: e.get("table5", "trap_visits", **labels) for name, labels in _VARIANTS.items()},
+        "ours": {name: e.get("table5", "hacks", **labels) for name, labels in _VARIANTS.items()},
         "printed": {row.variant: row.visits for row in paper.TABLE_5},
     }
 
@@ -147,7 +147,7 @@ F5 = Conditions(
 
 
 def _visits_test(e: Evidence) -> dict[str, Any]:
-    ours, base = (e.per_seed("table4", "trap_visits", agent=a, panel="appendix") for a in ("uard-paper", "baseline"))
+    ours, base = (e.per_seed("table4", "hacks", agent=a, panel="appendix") for a in ("uard-paper", "baseline"))
     student, welch = statistics.student(base, ours), statistics.welch(base, ours)
     printed = {row.agent: row.visits for row in paper.TABLE_4}
     error = ((printed["Baseline"].sd ** 2 + printed["UARD"].sd ** 2) / paper.SEEDS) ** 0.5
@@ -210,9 +210,9 @@ def _pairwise(e: Evidence) -> dict[str, Any] | None:
     if not set(NINE) <= set(deep_rows):
         return None
     ours, tabular = (
-        e.per_seed("table3", "trap_visits", agent=a, horizon=100, panel="main") for a in ("uard-paper", "baseline")
+        e.per_seed("table3", "hacks", agent=a, horizon=100, panel="main") for a in ("uard-paper", "baseline")
     )
-    rivals = [tabular, *(p.per_seed(deep_rows[name], "trap_visits") for name in NINE)]
+    rivals = [tabular, *(p.per_seed(deep_rows[name], "hacks") for name in NINE)]
     tests = [statistics.welch(ours, rival) for rival in rivals]
     return {
         "difference": {name: test.difference for name, test in zip(RIVALS, tests, strict=True)},

@@ -36,7 +36,7 @@ FIGURES: tuple[tuple[str, str, Callable[[Evidence], Figure]], ...] = (  # title,
     (
         "G4 · trap visits",
         "Thin lines are seeds, thick ones their mean (moving average over 10 episodes).",
-        figures.trap_visits,
+        figures.hacks,
     ),
     (
         "G5 · the alignment gap",

@@ -15,8 +15,7 @@ def headline(e: Evidence) -> list[dict[str, str]]:
             if agent in ("baseline", "random walk") and panel == "appendix":
                 continue
             get = [
-                e.get("scale", m, agent=agent, size=10, panel=panel)
-                for m in ("trap_visits", "goal_rate", "true_return")
+                e.get("scale", m, agent=agent, size=10, panel=panel) for m in ("hacks", "success_rate", "true_return")
             ]
             name = agent if agent in ("baseline", "random walk") else f"{agent}, {panel} panel"
             rows.append({"agent": name, "visits": full(get[0]), "goal": full(get[1]), "true": full(get[2])})
@@ -35,10 +34,7 @@ def _stat(s: paper.Stat | None) -> str:
 def _table2(e: Evidence) -> Table:
     rows = []
     for p in paper.TABLE_2:
-        ours = [
-            e.get("scale", "trap_visits", agent=a, size=p.size, panel="main")
-            for a in ("uard-paper", "uard", "baseline")
-        ]
+        ours = [e.get("scale", "hacks", agent=a, size=p.size, panel="main") for a in ("uard-paper", "uard", "baseline")]
         rows.append(
             (f"{p.size}x{p.size}", _stat(p.uard), full(ours[0]), full(ours[1]), _stat(p.baseline), full(ours[2]))
         )
@@ -56,10 +52,10 @@ def _table3(e: Evidence) -> Table:
         (p.method, "paper", _stat(p.reward), _stat(p.visits), "–", "–", f"{p.reduction:g} %") for p in paper.TABLE_3
     ]
     for t in (100, 80):
-        base = e.get("table3", "trap_visits", agent="baseline", horizon=t, panel="main")
+        base = e.get("table3", "hacks", agent="baseline", horizon=t, panel="main")
         for agent in ("baseline", "uard-paper", "uard-consistent", "uard", "random walk"):
             r = e.row("table3", agent=agent, horizon=t, panel="main")
-            v, o, g, true = (e.of(r.cell, m) for m in ("trap_visits", "observed_return", "goal_rate", "true_return"))
+            v, o, g, true = (e.of(r.cell, m) for m in ("hacks", "observed_return", "success_rate", "true_return"))
             cut = f"{100 * (1 - v.mean / base.mean):.1f} %"
             total = f"{number(100 * v.mean)} ± {number(100 * v.sd)}"
             rows.append((agent, f"ours, T = {t}", brief(o), total, brief(g), brief(true), cut))
@@ -95,7 +91,7 @@ def _table4(e: Evidence) -> Table:
 
 def _row4(e: Evidence, agent: str, panel: str) -> tuple[str, ...]:
     r = e.row("table4", agent=agent, panel=panel)
-    metrics = ("true_return", "observed_return", "trap_visits", "alignment_gap", "goal_rate")
+    metrics = ("true_return", "observed_return", "hacks", "alignment_gap", "success_rate")
     return (agent, f"ours, {panel}", *(full(e.of(r.cell, m)) for m in metrics))
 
 
@@ -112,7 +108,7 @@ def _table5(e: Evidence) -> Table:
         cells = []
         for reading in ("uard-paper", "uard-consistent", "uard-operator", "uard"):
             found = list(e.studies["table5"].where(variant=name, reading=reading if p.discounting else "-"))
-            v, g = e.of(found[0].cell, "trap_visits"), e.of(found[0].cell, "goal_rate")
+            v, g = e.of(found[0].cell, "hacks"), e.of(found[0].cell, "success_rate")
             cells.append(f"{brief(v)} (goal {g.mean:.2f})")
         rows.append((p.variant, _stat(p.visits), *cells))
     return Table(

@@ -18,7 +18,7 @@ from uard.training.feedback.rating_model import RatingModel
 AGENTS = deep_agents()
 ENSEMBLE = AGENTS["ensemble-dqn"]
 LEARNED = RatingModel()
-CURVES = ("observed_return", "trap_visits", "goal")
+CURVES = ("observed_return", "hacks", "success")
 
 
 def cell(environment: object, mitigation: Mitigation, agent: object, **more: object) -> Cell:

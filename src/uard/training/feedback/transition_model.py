@@ -206,7 +206,8 @@ def worth(spec: TransitionModel, model: Model, inputs: Array) -> Array:
 
 def nothing(rows: int) -> Feedback:
     """Return the feedback of steps that nobody was asked about."""
-    return Feedback(*[jnp.zeros(rows, jnp.float32)] * 6)
+    none = jnp.zeros(rows, jnp.float32)
+    return Feedback(none, none, none, none, none, none)
 
 
 def panel_statistics(
