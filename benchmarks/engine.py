@@ -32,8 +32,8 @@ from uard.lab.execution.trainers.tabular import Tabular
 from uard.lab.execution.training import train_batch
 from uard.lab.result import Result
 from uard.lab.study import Row, Study
-from uard.lab.views.evidence import Evidence
 from uard.lab.views.status import lines, status
+from uard.lab.views.study_results import StudyResults
 from uard.lab.views.tables import study_table
 from uard.method.mitigations import named
 
@@ -90,7 +90,7 @@ def listing(cells: int, folder: Path) -> dict[str, Any]:
     with closing(clocked("open", lambda: Store(path))) as store:
         jobs = cold.jobs([0])
         assert clocked("resume: what is missing", lambda: runner.run(jobs, store)) == 0
-        table = clocked("report: the study's table", lambda: study_table(cold, Evidence(store, [0], [cold])))
+        table = clocked("report: the study's table", lambda: study_table(cold, StudyResults(store, [0], [cold])))
         with open(folder / "table.txt", "w") as file:
             clocked("report: print it", lambda: show(table, Console(file=file)))
     every = [round(sum(s[i] for s in seconds.values()), 2) for i in (0, 1)]

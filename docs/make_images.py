@@ -5,7 +5,7 @@ from pathlib import Path
 from uard.lab import studies
 from uard.lab.execution import runner
 from uard.lab.execution.store import Store
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.replication import figures
 
 
@@ -14,7 +14,7 @@ def main() -> None:
     (study,) = studies.find(("scale",))
     store = Store(":memory:")
     runner.run(study.jobs([0]), store, workers=1)
-    figure = figures.walks(Evidence(store, [0], [study]))
+    figure = figures.walks(StudyResults(store, [0], [study]))
     figure.savefig(Path(__file__).parent / "images" / "walks.png", dpi=80, bbox_inches="tight")
 
 

@@ -10,7 +10,7 @@ A package names what it brings in its ``pyproject.toml``:
 | ``uard.environments``, ``uard.agents``, ``uard.mitigations`` | a class or a function | called without arguments (or with a mitigation's parameters) returns a frozen dataclass of that kind |
 | ``uard.studies`` | a function | returns ``{name of a group: (uard.lab.study.Study, ...)}``; groups of one name are joined |
 | ``uard.results`` | a function | returns a ``uard.lab.views.published.ResultFiles``: published results that a report may show |
-| ``uard.reports`` | a function of ``uard.lab.views.evidence.Evidence`` | returns ``uard.lab.views.sections.Section`` s of the report |
+| ``uard.reports`` | a function of ``uard.lab.views.study_results.StudyResults`` | returns ``uard.lab.views.sections.Section`` s of the report |
 | ``uard.commands`` | a frozen dataclass | is a command of ``uard``: its fields are the options, its docstring the help, ``run(console)`` what it does |
 
 Environments, agents, mitigations and commands are known by the entry point's name, which nobody else may have; the

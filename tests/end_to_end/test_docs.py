@@ -11,8 +11,8 @@ import pytest
 from uard.lab import studies
 from uard.lab.execution import runner
 from uard.lab.execution.store import Store
-from uard.lab.views.evidence import Evidence
 from uard.lab.views.published import packaged
+from uard.lab.views.study_results import StudyResults
 from uard.replication import locomotion
 
 ROOT = Path(__file__).parents[2]
@@ -73,13 +73,13 @@ def test_headline_table_is_true() -> None:
     store, seeds = Store(":memory:"), range(10)
     rows = [r for r in study.rows if r["size"] == 10 and r["agent"] != "uard-consistent"]
     runner.run([(r.cell, s) for r in rows for s in seeds], store, workers=1)
-    evidence = Evidence(store, seeds, [study])
+    results = StudyResults(store, seeds, [study])
     lines = [[c.strip() for c in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")][2:]
     assert len(lines) == 5
     for name, panel, *printed in lines:
         labels = {"panel": panel} | ROWS[name] | {"size": 10}
         for metric, shown in zip(("hacks", "success_rate", "true_return"), printed, strict=True):
-            ours = evidence.get("scale", metric, **labels)
+            ours = results.get("scale", metric, **labels)
             mean, sd = (float(x) for x in shown.split("±"))
             # Rounding, and what another processor's arithmetic may change: half a standard deviation.
             assert abs(mean - ours.mean) <= 0.05 + 0.5 * ours.sd, (name, metric, shown, ours)

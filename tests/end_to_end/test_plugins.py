@@ -20,7 +20,7 @@ from uard.lab.execution import runner
 from uard.lab.execution.store import Store
 from uard.lab.studies import plugins as own
 from uard.lab.views import leaderboard, sections
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.method import mitigations as mitigation
 from uard.method.mitigations import Raw, named
 from uard.plugins import PluginError
@@ -38,7 +38,7 @@ class Mine(Raw):
 
 @dataclass
 class Thawed(Mitigation):
-    def signal(self, evidence, usual):
+    def signal(self, results, usual):
         return evidence.reward
 
 def three():
@@ -69,10 +69,10 @@ def study(name):
     from uard.lab.study import Study, row
     return Study(name, "t", "a", (row(Cell(), a=1),))
 
-def sections(evidence):
-    return [evidence.get("no such study", "hacks")]
+def sections(results):
+    return [results.get("no such study", "hacks")]
 
-def made_already(evidence):
+def made_already(results):
     from uard.lab.views.sections import Section
     return [Section("made", "Made", 1, "<p>twice</p>")]
 """
@@ -351,8 +351,8 @@ def test_sections_of_packages_join_the_report(broken, tmp_path):
     store = Store(":memory:")
     (control,) = studies.find(("control",))
     runner.run(control.jobs(range(2)), store, workers=1)
-    evidence = Evidence(store, range(2), studies.grid())
-    good, bad = sections.of_packages(evidence, [sections.Section("made", "How this was made", 1000, "")])
+    results = StudyResults(store, range(2), studies.grid())
+    good, bad = sections.of_packages(results, [sections.Section("made", "How this was made", 1000, "")])
     (section,) = (s for s in good if s.id == "example")
     assert "a random walker, 6x6" in section.html
     assert section.losses == ("Nobody has tried uard on bells of 1000.",)

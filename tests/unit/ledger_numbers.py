@@ -10,7 +10,7 @@ from pathlib import Path
 from uard.lab import statistics, studies
 from uard.lab.execution.store import Store
 from uard.lab.statistics import Summary
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.replication.ledger.entries import CLAIMS, CONDITIONS, entry
 from uard.replication.paper import Stat
 
@@ -41,9 +41,9 @@ def decode(value):
 
 
 def main(store):
-    evidence, claims = Evidence(Store(store, readonly=True), SEEDS, studies.grid()), {}
+    results, claims = StudyResults(Store(store, readonly=True), SEEDS, studies.grid()), {}
     for claim in CLAIMS:
-        numbers = CONDITIONS[claim].numbers(evidence)
+        numbers = CONDITIONS[claim].numbers(results)
         found = entry(claim, numbers)
         claims[claim] = {"verdict": found.verdict, "count": found.count, "numbers": encode(numbers)}
     lines = (f"{json.dumps(c)}: {json.dumps(what, allow_nan=False)}" for c, what in claims.items())

@@ -15,8 +15,8 @@ from uard.envs.base import TableEnvironment
 from uard.envs.tables import HiddenTruth, Task
 from uard.lab.cell import Cell
 from uard.lab.study import Study, row
-from uard.lab.views.evidence import Evidence
 from uard.lab.views.sections import Section
+from uard.lab.views.study_results import StudyResults
 from uard.lab.views.tables import Table, full
 from uard.lab.views.templates import table
 from uard.method.mitigations import Raw, named
@@ -125,9 +125,9 @@ def studies() -> dict[str, tuple[Study, ...]]:
     return {"bells": (Study("loudness", "How loud may a bell be?", "an example", rows),)}
 
 
-def sections(evidence: Evidence) -> list[Section]:
+def sections(results: StudyResults) -> list[Section]:
     """Return what joins the report; ``evidence`` holds all studies of the group ``grid``."""
-    (walker, *_) = evidence.studies["control"].rows
-    rows = (("a random walker, 6x6", full(evidence.of(walker.cell, "hacks"))),)
+    (walker, *_) = results.studies["control"].rows
+    rows = (("a random walker, 6x6", full(results.of(walker.cell, "hacks"))),)
     shown = table(Table("What nobody has to learn", ("who", "trap visits per episode"), rows))
     return [Section("example", "An example", 200, shown, losses=("Nobody has tried uard on bells of 1000.",))]

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 RatingsFn = Callable[[Any, Any, Any, np.ndarray], Any]
 """(observations, actions, next observations, observed rewards), all (B, ...) -> ratings (B, K), NaN where missing."""
 SigmaFn = Callable[[Any, Any], Any]
-"""(observations, actions), both (B, ...) -> sigma_m (B,). If it has ``update(observations, actions, rewards)``, it is
-told of every step afterwards."""
+"""(observations, actions), both (B, ...) -> sigma_m (B,). If it has ``update(observations, actions, rewards)``, that
+is called with every step afterwards."""
 KeyFn = Callable[[Any, Any], Hashable]
 """(observation, action) of one step -> what tells it from other state-actions."""
 

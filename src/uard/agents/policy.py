@@ -356,7 +356,7 @@ class CPO(TrustRegion):
     """Constrained policy optimisation: TRPO that keeps the cost of an episode within a budget.
 
     WARNING: with ``oracle`` (the default) the cost of a step is the HIDDEN TRUTH, whether the step was a hack. This is
-    the one place in the package where a learner is told what only the evaluation may see; what it then achieves is a
+    the one place in the package where a learner sees what only the evaluation may see; what it then achieves is a
     bound on what anybody could who knew every hack, not a result. Without it the cost is 0 everywhere, as the paper's
     evidently was: its CPO hacks as much as its other baselines; and CPO then is TRPO.
 

@@ -84,12 +84,12 @@ class Reproduce:
                     terminal.warning(console, text)
             terminal.say(console, f"report: {written}")
         else:
-            from uard.lab.views.evidence import Evidence
+            from uard.lab.views.study_results import StudyResults
             from uard.lab.views.tables import study_table
 
-            evidence = Evidence(store, seeds, chosen)
+            results = StudyResults(store, seeds, chosen)
             for study in chosen:
-                terminal.show(study_table(study, evidence))
+                terminal.show(study_table(study, results))
 
     def _engine(self) -> Any:
         if _checks.choose("engine", self.engine, ("local", "ray")) == "ray":

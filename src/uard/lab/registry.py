@@ -149,7 +149,7 @@ def agent(name: str, changes: dict[str, Any], environment: Any = None) -> Agent:
 
 
 def rating_model(name: str | None, of: Agent, environment: Any) -> RatingModel | TransitionModel | None:
-    """Return how an agent knows of ratings in an environment: by its name, or as usual there.
+    """Return how an agent knows of ratings in an environment: by its name, or the first way its trainer has.
 
     Raises:
         UnknownNameError: it cannot know of them in that way.

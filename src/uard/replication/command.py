@@ -35,7 +35,7 @@ class Ledger:
         """Train what is missing, then print the ledger."""
         from uard.lab import studies
         from uard.lab.execution.store import Store
-        from uard.lab.views.evidence import Evidence
+        from uard.lab.views.study_results import StudyResults
         from uard.replication import ledger
 
         _checks.whole("seeds", self.seeds, low=2, high=100_000)
@@ -47,8 +47,8 @@ class Ledger:
         jobs = [job for study in grid for job in study.jobs(seeds)]
         what = "what the ledger needs"
         training.train(jobs, store, console, what, self.watch, workers=self.workers, studies=grid)
-        evidence = Evidence(store, seeds, grid)
-        entries = [e for e in ledger.entries(evidence) if not self.claims or e.claim in self.claims]
+        results = StudyResults(store, seeds, grid)
+        entries = [e for e in ledger.entries(results) if not self.claims or e.claim in self.claims]
         if self.json is not None:
             terminal.write_json(ledger.as_data(entries, seeds), self.json)
         if self.json != "-":

@@ -48,8 +48,8 @@ def _baselines(p: Published) -> Table:
         ("method", "source", "trap visits", "observed return", "goal rate", "true return"),
         tuple(rows) if p.rows("deep-baselines") else (),
         2,
-        "Same network, budget and reward stream for all (J35). cpo is told of no cost, as the paper's evidently was; "
-        "cpo-oracle is told every hack, which no learner could know.",
+        "Same network, budget and reward stream for all (J35). cpo sees no cost, as the paper's evidently was; "
+        "cpo-oracle sees every hack, which no learner could know.",
     )
 
 
@@ -251,10 +251,10 @@ def _credentials() -> Table:
     for row in data["rows"]:
         if "returns" in row:
             who = "ours" if row["who"] == "ours" else LIBRARIES[row.get("library", "stable-baselines3")]
-            seeds, said = str(len(row["returns"])), full(statistics.summarise(row["returns"]))
+            seeds, returned = str(len(row["returns"])), full(statistics.summarise(row["returns"]))
         else:
-            who, seeds, said = row["who"], "–", f"{row['mean']} ± {row['sd']}"
-        rows.append((row["task"], row["agent"], who, seeds, f"{row['budget']:,}", said))
+            who, seeds, returned = row["who"], "–", f"{row['mean']} ± {row['sd']}"
+        rows.append((row["task"], row["agent"], who, seeds, f"{row['budget']:,}", returned))
     return Table(
         "Credentials: returns beside Stable-Baselines3, sb3-contrib, SBX and published ones",
         ("task", "agent", "whose", "seeds", "steps", "return"),

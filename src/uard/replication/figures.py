@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from uard.lab.views.evidence import Evidence
 from uard.lab.views.figures import COLOURS, axes_of
+from uard.lab.views.study_results import StudyResults
 from uard.method.stability import DEFINITIONS, perturbed_advantage
 from uard.method.weights import exponential_weight, linear_weight, reciprocal_weight
 from uard.replication import paper, theory
@@ -29,7 +29,7 @@ def _curve(axis: Axes, curves: np.ndarray, label: str, colour: str) -> None:
     axis.plot(x, smooth.mean(0), color=colour, lw=2, label=label)
 
 
-def filters(e: Evidence) -> Figure:
+def filters(results: StudyResults) -> Figure:
     """G2: weights against uncertainty, and what each form does to the paper's trap."""
     figure, (left, right) = axes_of(2, 5.5)
     u = np.linspace(0, 5, 400)
@@ -43,9 +43,9 @@ def filters(e: Evidence) -> Figure:
     left.annotate("the paper's trap", (0.5 * paper.SIGMA_H_AT_TRAP, 0.95), (0.9, 0.95), fontsize=9)
     left.set(xlabel="uncertainty U", ylabel="weight w", title="Filters at lambda = 2")
     left.legend()
-    forms = list(dict.fromkeys(r["form"] for r in e.studies["filters"].rows))
+    forms = list(dict.fromkeys(r["form"] for r in results.studies["filters"].rows))
     for i, reading in enumerate(("uard-paper", "uard-consistent", "uard")):
-        s = [e.get("filters", "success_rate", form=f, reading=reading) for f in forms]
+        s = [results.get("filters", "success_rate", form=f, reading=reading) for f in forms]
         place = np.arange(len(forms)) + (i - 1) * 0.26
         right.bar(place, [x.mean for x in s], 0.24, color=COLOURS[reading], label=reading)
         low, high = np.array([[x.mean - x.ci95[0], x.ci95[1] - x.mean] for x in s]).T
@@ -56,53 +56,53 @@ def filters(e: Evidence) -> Figure:
     return figure
 
 
-def _training(e: Evidence, column: str, agents: Sequence[str], ylabel: str, title: str) -> Figure:
+def _training(results: StudyResults, column: str, agents: Sequence[str], ylabel: str, title: str) -> Figure:
     figure, axes = axes_of(2, 5.8)
     for axis, panel in zip(axes, ("main", "appendix"), strict=True):
         for agent in agents:
-            _curve(axis, e.curves("table4", column, agent=agent, panel=panel), agent, COLOURS[agent])
+            _curve(axis, results.curves("table4", column, agent=agent, panel=panel), agent, COLOURS[agent])
         axis.set(xlabel="episode", ylabel=ylabel, title=f"{title}, {panel} panel")
     axes[0].legend()
     return figure
 
 
-def hero(e: Evidence) -> Figure:
+def hero(results: StudyResults) -> Figure:
     """G3: observed return against episode; the paper shows a sharp turn to the goal near episode 400."""
-    figure = _training(e, "observed_return", ("baseline", "uard-paper", "uard"), "observed return", "6x6")
+    figure = _training(results, "observed_return", ("baseline", "uard-paper", "uard"), "observed return", "6x6")
     for axis in figure.axes:
         axis.axvline(400, color="k", ls=":", lw=1)
         axis.annotate("the paper's turn", (400, 40), (405, 40), fontsize=9)
     return figure
 
 
-def hacks(e: Evidence) -> Figure:
+def hacks(results: StudyResults) -> Figure:
     """G4: trap visits per episode."""
     agents = ("baseline", "multi-head", "uard-paper", "uard")
-    return _training(e, "hacks", agents, "trap visits per episode", "6x6")
+    return _training(results, "hacks", agents, "trap visits per episode", "6x6")
 
 
-def alignment_gap(e: Evidence) -> Figure:
+def alignment_gap(results: StudyResults) -> Figure:
     """G5: observed and true return of the baseline drift apart; of ``uard`` they do not."""
     figure, axes = axes_of(2, 5.8)
     for axis, agent in zip(axes, ("baseline", "uard"), strict=True):
-        _curve(axis, e.curves("table4", "observed_return", agent=agent, panel="main"), "observed", "#2c6fbb")
-        _curve(axis, e.curves("table4", "true_return", agent=agent, panel="main"), "true", "#e08214")
+        _curve(axis, results.curves("table4", "observed_return", agent=agent, panel="main"), "observed", "#2c6fbb")
+        _curve(axis, results.curves("table4", "true_return", agent=agent, panel="main"), "true", "#e08214")
         axis.set(xlabel="episode", ylabel="return", title=f"{agent}, 6x6, main panel")
         axis.legend()
     return figure
 
 
-def true_return(e: Evidence) -> Figure:
+def true_return(results: StudyResults) -> Figure:
     """G8: true return against episode."""
-    return _training(e, "true_return", ("baseline", "multi-head", "uard-paper", "uard"), "true return", "6x6")
+    return _training(results, "true_return", ("baseline", "multi-head", "uard-paper", "uard"), "true return", "6x6")
 
 
-def uncertainty(e: Evidence) -> Figure:
+def uncertainty(results: StudyResults) -> Figure:
     """G9: both uncertainties over training, at the trap and elsewhere."""
     figure, axes = axes_of(2, 5.8)
     for axis, panel in zip(axes, ("main", "appendix"), strict=True):
-        row = e.row("uncertainty", agent="uard-paper", panel=panel, heads="bootstrapped")
-        curves = np.stack([r.extra["uncertainty"] for r in e.results(row.cell)]).astype(float)
+        row = results.row("uncertainty", agent="uard-paper", panel=panel, heads="bootstrapped")
+        curves = np.stack([r.extra["uncertainty"] for r in results.results(row.cell)]).astype(float)
         x = (np.arange(curves.shape[1]) + 1) * 500 / curves.shape[1]
         lines = (("sigma_m, trap", "#2c6fbb", "-"), ("sigma_m, elsewhere", "#2c6fbb", ":"))
         lines += (("sigma_h, trap", "#c1272d", "-"), ("sigma_h, elsewhere", "#c1272d", ":"))
@@ -117,7 +117,7 @@ def uncertainty(e: Evidence) -> Figure:
     return figure
 
 
-def noise(e: Evidence) -> Figure:
+def noise(results: StudyResults) -> Figure:
     """G11 on the grid: trap visits against rater noise, in both units."""
     figure, axes = axes_of(2, 5.8)
     rng = np.random.default_rng(0)
@@ -126,7 +126,7 @@ def noise(e: Evidence) -> Figure:
         for agent in agents:
             colour = COLOURS.get(agent, COLOURS["mean-of-annotations"])
             levels = (0, 10, 20, 30)
-            v = [e.per_seed("noise", "hacks", agent=agent, panel="main", percent=p, unit=unit) for p in levels]
+            v = [results.per_seed("noise", "hacks", agent=agent, panel="main", percent=p, unit=unit) for p in levels]
             mean, sd = np.array([x.mean() for x in v]), np.array([x.std(ddof=1) for x in v])
             axis.plot(levels, mean, "o-", color=colour, lw=2, label=agent)
             axis.fill_between(levels, mean - sd, mean + sd, color=colour, alpha=0.15, lw=0)
@@ -138,7 +138,7 @@ def noise(e: Evidence) -> Figure:
     return figure
 
 
-def sign_preservation(e: Evidence) -> Figure:
+def sign_preservation(results: StudyResults) -> Figure:
     """G13: the advantage of entering the trap against a reward perturbation, by three definitions."""
     figure, axes = axes_of(3, 4.4, 3.6)
     for axis, definition, radius in zip(axes, DEFINITIONS, theory.radii(), strict=True):
@@ -152,18 +152,18 @@ def sign_preservation(e: Evidence) -> Figure:
     return figure
 
 
-def learning_curves(e: Evidence) -> Figure:
+def learning_curves(results: StudyResults) -> Figure:
     """G16: observed return of every agent on 6x6."""
     agents = ("baseline", "multi-head", "uard-paper", "uard-consistent", "uard", "random walk")
-    return _training(e, "observed_return", agents, "observed return", "6x6")
+    return _training(results, "observed_return", agents, "observed return", "6x6")
 
 
-def walks(e: Evidence) -> Figure:
+def walks(results: StudyResults) -> Figure:
     """What the trained agents do: visits per cell of their greedy walk on 10x10."""
     figure, axes = axes_of(3, 4.2, 4.4)
     for axis, agent in zip(axes, ("baseline", "uard-paper", "uard"), strict=True):
-        cell = e.row("scale", agent=agent, size=10, panel="main").cell
-        path = e.results(cell)[0].path
+        cell = results.row("scale", agent=agent, size=10, panel="main").cell
+        path = results.results(cell)[0].path
         grid = cell.environment
         counts = np.bincount(path, minlength=grid.states).reshape(grid.size, grid.size)
         axis.imshow(np.where(counts > 0, np.log1p(counts), np.nan), cmap="Blues", vmin=0, vmax=np.log1p(900))

@@ -30,8 +30,8 @@ HEADS = ("steps in the region per episode", "true return", "observed return")  #
 COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", "uard": "#2c6fbb"}
 
 
-def said(values: np.ndarray) -> str:
-    """Say what one number per seed is: mean, deviation and interval; of one seed, that number alone."""
+def summary(values: np.ndarray) -> str:
+    """Return one number per seed as text: mean, deviation and interval; of one seed, that number alone."""
     return full(statistics.summarise(values)) if len(values) > 1 else number(values[0])
 
 
@@ -57,10 +57,10 @@ def _steps(p: Published, study: str) -> str:
 def _hacking(p: Published) -> Table:
     rows = []
     for r in p.rows(HACKING):
-        cells = (said(p.per_seed(r, m)) for m in METRICS)
+        cells = (summary(p.per_seed(r, m)) for m in METRICS)
         share = _shares(p, r)
         where = f"{r['robot']}, {r['region']}" if r["region"] != "none" else f"{r['robot']}, no lie"
-        best = (said(x) for x in p.derived(r, "deterministic").T)
+        best = (summary(x) for x in p.derived(r, "deterministic").T)
         rows.append((where, r["agent"], r["mitigation"], r["panel"], *cells, *share, *best))
     return Table(
         f"Hopper and Walker2d with a reward that lies (G6, G7), {_steps(p, HACKING)}, 15 % of steps rated",
@@ -136,7 +136,7 @@ def headline(p: Published) -> str:
     raw, ours = ([p.of(r, "hacks").mean for r in lies if r["mitigation"] == m] for m in ("raw", "uard"))
     kept = {
         m: " and ".join(
-            f"{said(100 * found[1])} % ({robot})"
+            f"{summary(100 * found[1])} % ({robot})"
             for robot in ("hopper", "walker2d")
             if (found := pooled(p, robot, "ppo", m)) is not None
         )
@@ -147,16 +147,16 @@ def headline(p: Published) -> str:
     (honest,) = (r for r in hopper if (r["region"], r["mitigation"]) == ("vibration", "true reward"))
     plain = {r["mitigation"]: r for r in hopper if r["region"] == "none"}
     _, by_sac = pooled(p, "hopper", "sac", "uard") or (None, None)
-    sac = f" SAC on Hopper keeps {said(100 * by_sac)} % ({len(by_sac)} seeds)." if by_sac is not None else ""
+    sac = f" SAC on Hopper keeps {summary(100 * by_sac)} % ({len(by_sac)} seeds)." if by_sac is not None else ""
     return (
         f"PPO on the raw reward spends {min(raw):.0f} to {max(raw):.0f} steps of an episode where the reward lies, with "
         f"`uard` at most {number(max(ours))}. Over all settings of a robot `uard` keeps {kept['uard']} of the true return of "
         f"the agent trained on the true reward; as printed, {kept['uard-paper']}. "
         f"With noise of 30 % of the bonus on every rating (Hopper, vibration) it spends "
-        f"{said(p.per_seed(noisy, 'hacks'))} steps where the reward lies and has a true return of "
-        f"{said(p.per_seed(noisy, 'true_return'))}; the honest agent has {said(p.per_seed(honest, 'true_return'))}. "
+        f"{summary(p.per_seed(noisy, 'hacks'))} steps where the reward lies and has a true return of "
+        f"{summary(p.per_seed(noisy, 'true_return'))}; the honest agent has {summary(p.per_seed(honest, 'true_return'))}. "
         f"Without a lie (Hopper, {len(p.seeds_of(plain['uard']))} seeds) its true return is "
-        f"{said(p.per_seed(plain['uard'], 'true_return'))}, the raw agent's {said(p.per_seed(plain['raw'], 'true_return'))}."
+        f"{summary(p.per_seed(plain['uard'], 'true_return'))}, the raw agent's {summary(p.per_seed(plain['raw'], 'true_return'))}."
         f"{sac}{_others(p)}"
     )
 
@@ -187,7 +187,7 @@ def _pooled(p: Published) -> Table:
     for robot, agent in _settings(p):
         for mitigation in ("uard-paper", "uard"):
             if (found := pooled(p, robot, agent, mitigation)) is not None:
-                shares = (said(100 * x) for x in found)
+                shares = (summary(100 * x) for x in found)
                 rows.append((robot, agent, mitigation, str(len(found[0])), *shares))
     return Table(
         "The same, both regions and both panels together",
@@ -201,7 +201,7 @@ def _pooled(p: Published) -> Table:
 
 def _noise(p: Published) -> Table:
     rows = [
-        (r["agent"], r["mitigation"], f"{100 * r['noise']:.0f} %", *(said(p.per_seed(r, m)) for m in METRICS))
+        (r["agent"], r["mitigation"], f"{100 * r['noise']:.0f} %", *(summary(p.per_seed(r, m)) for m in METRICS))
         for r in p.rows(NOISE)
     ]
     return Table(
@@ -219,7 +219,7 @@ def _kick(p: Published) -> Table:
             r["mitigation"],
             r["kicked"],
             f"{r['at'] or '–'}",
-            *(said(p.per_seed(r, m)) for m in (*METRICS, "episode_length")),
+            *(summary(p.per_seed(r, m)) for m in (*METRICS, "episode_length")),
         )
         for r in p.rows(KICK)
     ]
@@ -235,9 +235,9 @@ def _kick(p: Published) -> Table:
 def _bonuses(p: Published) -> Table:
     published = p.rows(BONUSES)
     rows = [
-        (r["region"], f"{r['bonus']:g}", r["mitigation"], r["panel"], *(said(p.per_seed(r, m)) for m in METRICS))
+        (r["region"], f"{r['bonus']:g}", r["mitigation"], r["panel"], *(summary(p.per_seed(r, m)) for m in METRICS))
         for r in published
-        if len({r["bonus"] for r in published}) > 1  # the usual bonus alone is in the first table
+        if len({r["bonus"] for r in published}) > 1  # the default bonus alone is in the first table
     ]
     return Table(
         f"How large a bonus breaks which mitigation: Hopper, PPO, {_steps(p, BONUSES)}",
@@ -249,7 +249,7 @@ def _bonuses(p: Published) -> Table:
 
 def _legitimate(p: Published) -> Table:
     rows = [
-        (r["region"], r["mitigation"], r["panel"], *(said(p.per_seed(r, m)) for m in METRICS))
+        (r["region"], r["mitigation"], r["panel"], *(summary(p.per_seed(r, m)) for m in METRICS))
         for r in p.rows(LEGITIMATE)
     ]
     return Table(
@@ -266,9 +266,9 @@ def _caution(p: Published) -> Table:
     rows = []
     for r in p.rows(CAUTION):
         kept = _kept(p, r, _found(p, CAUTION, learns_from="raw"))
-        best = (said(x) for x in p.derived(r, "deterministic").T[1:])
+        best = (summary(x) for x in p.derived(r, "deterministic").T[1:])
         share = "–" if kept is None else f"{100 * kept:.0f} %"
-        rows.append((r["learns_from"], said(p.per_seed(r, "true_return")), share, *best))
+        rows.append((r["learns_from"], summary(p.per_seed(r, "true_return")), share, *best))
     return Table(
         f"What listening costs where nothing lies: Hopper, PPO, main panel, {_steps(p, CAUTION)}, 15 % of steps rated",
         ("learns from", "true return", "of the raw agent's", "deterministic: true return"),
@@ -281,7 +281,7 @@ def _caution(p: Published) -> Table:
 
 def _ablation(p: Published) -> Table:
     rows = [
-        (r["agent"], r["region"], r["variant"], r["panel"], *(said(p.per_seed(r, m)) for m in METRICS))
+        (r["agent"], r["region"], r["variant"], r["panel"], *(summary(p.per_seed(r, m)) for m in METRICS))
         for r in p.rows(ABLATION)
     ]
     return Table(
@@ -297,8 +297,8 @@ def _ablation(p: Published) -> Table:
 def _rating(p: Published) -> Table:
     rows = []
     for r in p.rows(RATING):
-        best = (said(x) for x in p.derived(r, "deterministic").T)
-        cells = (said(p.per_seed(r, m)) for m in ("hacks", "true_return"))
+        best = (summary(x) for x in p.derived(r, "deterministic").T)
+        cells = (summary(p.per_seed(r, m)) for m in ("hacks", "true_return"))
         rows.append((r["region"], r["panel"], r["query"], *cells, *best))
     return Table(
         f"Which steps are rated: Hopper, PPO with uard, {_steps(p, RATING)}, 15 % of steps",
@@ -316,7 +316,7 @@ def _distortion(p: Published) -> Table:
     rows = []
     for r in p.rows(DISTORTION):
         columns = np.column_stack([p.derived(r, "reaction"), p.derived(r, "warning")]).T
-        rows.append((r["agent"], r["critics"], *(said(c) for c in columns)))
+        rows.append((r["agent"], r["critics"], *(summary(c) for c in columns)))
     return Table(
         f"A distorted reward after training (G12, G14, G15; H13, H15, H16) on Hopper, {_steps(p, DISTORTION)}",
         (
@@ -376,7 +376,7 @@ def _of_distortion(p: Published) -> list[str]:
     if len(rows) == 2:
         shared, full_ones = (list(p.derived(rows[k], "warning").T) for k in ("5, shared trunk", "5, full"))
         worse = [
-            f"{what} {said(a)} against {said(b)}"
+            f"{what} {summary(a)} against {summary(b)}"
             for what, a, b in zip(("states thrown off", "wrong values"), shared, full_ones, strict=True)
             if b.mean() - a.mean() > AS_GOOD
         ]
@@ -403,7 +403,7 @@ def _of_hacking(p: Published) -> list[str]:
     poor = [(r, f"{100 * x:.0f} %") for r, _, x in lies if x is not None and x < KEPT]
     judged = sum(x is not None for _, x, _ in lies)
     together = [
-        f"{robot} {agent} {said(100 * found[1])} %"
+        f"{robot} {agent} {summary(100 * found[1])} %"
         for robot, agent in _settings(p)
         if (found := pooled(p, robot, agent, "uard")) is not None
     ]
@@ -432,7 +432,7 @@ def _of_hacking(p: Published) -> list[str]:
             f"MuJoCo without a lie: uard costs more than 5 % of the true return in {len(dear)} of {len(plain)} "
             f"settings{_listed(dear)}."
         )
-    parts = [f"{r['learns_from']} {said(p.per_seed(r, 'true_return'))}" for r in p.rows(CAUTION)]
+    parts = [f"{r['learns_from']} {summary(p.per_seed(r, 'true_return'))}" for r in p.rows(CAUTION)]
     if parts:
         out.append(
             f"MuJoCo without a lie, which part of listening costs (Hopper, PPO, true return): {'; '.join(parts)}."
@@ -454,7 +454,7 @@ def _of_noise(p: Published) -> list[str]:
         )
         removed, kept = _removed(p, r, raw), _kept(p, r, honest)
         if r["noise"] and ((removed is not None and removed < REMOVED) or (kept is not None and kept < KEPT)):
-            hacks, true = (said(p.per_seed(r, m)) for m in ("hacks", "true_return"))
+            hacks, true = (summary(p.per_seed(r, m)) for m in ("hacks", "true_return"))
             missed.append(f"{r['agent']} at {100 * r['noise']:.0f} %: {hacks} hack steps, true return {true}")
     better = []
     for r in p.rows(NOISE, mitigation="uard"):
@@ -463,9 +463,9 @@ def _of_noise(p: Published) -> list[str]:
             x for x in p.rows(NOISE, agent=r["agent"], noise=r["noise"]) if x["mitigation"] not in ("uard", "raw")
         ]
         if over := [x for x in rivals if p.of(x, "true_return").mean > own]:
-            names = ", ".join(f"{x['mitigation']} {said(p.per_seed(x, 'true_return'))}" for x in over)
+            names = ", ".join(f"{x['mitigation']} {summary(p.per_seed(x, 'true_return'))}" for x in over)
             better.append(
-                f"{r['agent']} at {100 * r['noise']:.0f} %: {names} (uard {said(p.per_seed(r, 'true_return'))})"
+                f"{r['agent']} at {100 * r['noise']:.0f} %: {names} (uard {summary(p.per_seed(r, 'true_return'))})"
             )
     out = []
     if missed:
@@ -545,12 +545,12 @@ def film() -> list[tuple[str, str, str]]:
     facts = packaged_json("hopper-frames.json")
     if facts is None:
         return []
-    said = [
+    shown = [
         f"{r['label']}: {r['true_return']:.0f} in {r['length']} steps, {r['hacks']} in the region"
         for r in facts["rows"]
     ]
     note = (
-        f"From the top, each an episode whole, its true return and its length: {'; '.join(said)}. 42 and 110 are the "
+        f"From the top, each an episode whole, its true return and its length: {'; '.join(shown)}. 42 and 110 are the "
         f"paper's thresholds: a robot that falls over. One seed. Made by {facts['command']}, version {facts['version']}."
     )
     picture = (resources.files("uard.replication") / "results" / "hopper-frames.webp").read_bytes()

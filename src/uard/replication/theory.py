@@ -27,13 +27,13 @@ def expected_sigma_h(panel: str, size: int, trap: float, draws: int = 20_000, dd
     """Mean sigma_h of one visit's ratings, at a trap and elsewhere (seeded Monte Carlo)."""
     grid = paper_grid(size, trap)
     truth = grid.truth()
-    said = grid.rating_law(as_panel(panel))
+    law = grid.rating_law(as_panel(panel))
     rng = np.random.default_rng(0)
     means = []
     for where in (truth.hack, ~truth.hack):
         s, a = np.argwhere(where)[0]
-        spoken = said.centre[s, a] + said.deviation[s, a] * rng.normal(size=(draws, said.centre.shape[-1]))
-        means.append(float(spoken.std(-1, ddof=ddof).mean()))
+        ratings = law.centre[s, a] + law.deviation[s, a] * rng.normal(size=(draws, law.centre.shape[-1]))
+        means.append(float(ratings.std(-1, ddof=ddof).mean()))
     return means[0], means[1]
 
 

@@ -81,13 +81,13 @@ class LearnedRewardGrid(TableEnvironment):
         """Fit the ensemble to the panel's mean rating of entering each rated cell; mean and deviation, (S,) each."""
         grid, rated = self.grid(), self.rated()
         task, truth = grid.task(), grid.truth()
-        said = law_of_tables(MAIN, task, truth).centre.mean(-1)
+        rating = law_of_tables(MAIN, task, truth).centre.mean(-1)
         entered, by_cell = task.next_state, np.zeros(self.states)
-        by_cell[entered.ravel()] = said.ravel()
+        by_cell[entered.ravel()] = rating.ravel()
         rng = np.random.default_rng(self.model_seed)
         place = np.stack(np.divmod(np.arange(self.states), self.size), 1) / self.size
         known = np.flatnonzero(rated)
-        usual = np.median(by_cell[known])
+        median = np.median(by_cell[known])
         wave = rng.normal(size=(2, FEATURES)) * 2 * np.pi * self.frequency
         phase = rng.uniform(0, 2 * np.pi, FEATURES)
         features = np.sqrt(2 / FEATURES) * self.amplitude * np.cos(place @ wave + phase)
@@ -97,8 +97,8 @@ class LearnedRewardGrid(TableEnvironment):
         fit = seen.T @ np.linalg.inv(seen @ seen.T + NOISE**2 * np.eye(len(known)))
         # Each member starts from beliefs of its own and corrects them where there are ratings [Osband et al. 2018].
         prior = rng.normal(size=(features.shape[1], self.members))
-        heard = (by_cell[known] - usual)[:, None] + NOISE * rng.normal(size=(len(known), self.members))
-        belief = usual + (features @ (prior + fit @ (heard - seen @ prior))).T
+        targets = (by_cell[known] - median)[:, None] + NOISE * rng.normal(size=(len(known), self.members))
+        belief = median + (features @ (prior + fit @ (targets - seen @ prior))).T
         return belief.mean(0), belief.std(0, ddof=1)
 
     def task(self, dtype: DTypeLike = np.float32) -> Task:

@@ -90,7 +90,7 @@ class Locomotion(SimulatedEnvironment):
     Attributes:
         robot: A name in ``ROBOTS``.
         version: Of Gymnasium's task: 4 pays for health on the step that falls, 5 does not; never mix them.
-        region: Where the observed reward lies, or a name in ``REGIONS``, for the region with its usual numbers; nowhere
+        region: Where the observed reward lies, or a name in ``REGIONS``, for that region with default numbers; nowhere
             if None.
         kick: See ``Kick``.
         legitimate: Whether the region's bonus is real.

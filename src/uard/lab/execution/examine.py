@@ -143,18 +143,18 @@ class _RewardFn:
                 found = measure(m, job.rating_model, state.model, sample, seen, raters=self.raters)
                 self.statistics[m] = jax.tree.map(lambda x: np.asarray(x, float), found)
 
-    def opinions(self, observations: np.ndarray) -> np.ndarray:
+    def values(self, observations: np.ndarray) -> np.ndarray:
         """Return all critics' values, (N, B)."""
         return np.asarray(self.loop.values(self.state, observations), float)
 
     def value(self, observations: np.ndarray) -> np.ndarray:
         """Return their mean, (B,)."""
-        return self.opinions(observations).mean(0)
+        return self.values(observations).mean(0)
 
     def doubt(self, observations: np.ndarray) -> np.ndarray:
         """Return sigma_m of states, (B,)."""
-        opinions = self.opinions(observations)
-        return opinions.std(0, ddof=1) if len(opinions) > 1 else np.zeros(opinions.shape[1])
+        values = self.values(observations)
+        return values.std(0, ddof=1) if len(values) > 1 else np.zeros(values.shape[1])
 
     def __call__(self, steps: Walked, reward: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what the agent and a static pessimist would learn from steps so rewarded, and lambda_t; (B,) each."""
@@ -166,11 +166,11 @@ class _RewardFn:
         statistics = {m: transitions.expecting(s, evidence.feedback) for m, s in self.statistics.items()}
         why = mitigation.explain(evidence, statistics[mitigation])
         adjusted = np.asarray(why.signal.reward, float)
-        opinions = self.opinions(steps.observation)
+        values = self.values(steps.observation)
         if heat := getattr(agent, "backup_temperature", 0.0):
-            adjusted = adjusted * backup_trust(opinions.std(0, ddof=1), heat)
+            adjusted = adjusted * backup_trust(values.std(0, ddof=1), heat)
         elif getattr(agent, "diversity", 0.0):
-            adjusted = adjusted - (opinions.mean(0) - opinions.min(0))
+            adjusted = adjusted - (values.mean(0) - values.min(0))
         caution = reward
         if self.job.asks_raters:
             caution = np.asarray(CAUTION.signal(evidence, statistics[CAUTION]).reward)

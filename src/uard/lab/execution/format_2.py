@@ -79,8 +79,8 @@ _VERSION = 1  # of all kinds of training
 
 
 def _rater(**changes: Any) -> dict[str, Any]:
-    usual = {"temptation": 0.0, "bias": 0.0, "scale": 1.0, "noise": 0.1, "contested_noise": None, "lapse": 0.0}
-    return {TYPE: "Rater", **usual, "coverage": 1.0, "stars": None, **changes}
+    default = {"temptation": 0.0, "bias": 0.0, "scale": 1.0, "noise": 0.1, "contested_noise": None, "lapse": 0.0}
+    return {TYPE: "Rater", **default, "coverage": 1.0, "stars": None, **changes}
 
 
 def _panel(*raters: dict[str, Any]) -> dict[str, Any]:

@@ -48,14 +48,14 @@ class Migration:
 
 
 def lines(migration: Migration) -> list[str]:
-    """Return what is to be said of it."""
+    """Return the report's lines."""
     m = migration
     others = ", ".join(f"{count} {table}" for table, count in m.rows.items() if table != "results")
-    said = [f"{m.path}: {m.cells} cells, {m.rows['results']} seeds have new keys{f'; {others}' if others else ''}"]
-    said += [f"only in {m.backup}: {count} rows, for {why}" for why, count in m.left.items()]
+    text = [f"{m.path}: {m.cells} cells, {m.rows['results']} seeds have new keys{f'; {others}' if others else ''}"]
+    text += [f"only in {m.backup}: {count} rows, for {why}" for why, count in m.left.items()]
     if m.checkpoints:
-        said.append(f"{m.checkpoints} long runs begin again: their checkpoints are an older version's")
-    return [*said, f"the old file is kept as {m.backup}"]
+        text.append(f"{m.checkpoints} long runs begin again: their checkpoints are an older version's")
+    return [*text, f"the old file is kept as {m.backup}"]
 
 
 def migrate(path: str | Path) -> Migration:

@@ -145,8 +145,8 @@ def draw(problem: Problem, panel: str, seed: int) -> Drawn:
     shared = _preferences(problem, flattered, random)
     scores = np.empty((problem.pool, problem.models))
     for k in range(problem.models):
-        said = shared if panel == "colluding" else _preferences(problem, flattered if k < likes else gold, random)
-        scores[:, k] = _fitted(problem, said, random)(pool)
+        preferred = shared if panel == "colluding" else _preferences(problem, flattered if k < likes else gold, random)
+        scores[:, k] = _fitted(problem, preferred, random)(pool)
     worth = gold(pool)
     return Drawn((worth - worth.mean()) / worth.std(), (scores - scores.mean(0)) / scores.std(0))
 
@@ -278,7 +278,7 @@ def run(seeds: Sequence[int], problem: Problem | None = None, panels: Sequence[s
 
     Args:
         seeds: Seeds, at least one; all methods see the same draws.
-        problem: The sizes; the usual ones if left out.
+        problem: The sizes; the default ones if left out.
         panels: Some of ``PANELS``.
     """
     problem = problem or Problem()

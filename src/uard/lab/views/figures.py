@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from uard.lab.study import Row
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 
 matplotlib.use("Agg")
 
@@ -55,14 +55,15 @@ def axes_of(columns: int = 1, width: float = 7.0, height: float = 3.8) -> tuple[
     return figure, list(axes)
 
 
-def competition(e: Evidence) -> Figure:
+def competition(results: StudyResults) -> Figure:
     """True return of the serious rivals against rater noise, 10x10."""
     figure, axes = axes_of(2, 5.8)
-    noises = list(dict.fromkeys(r["noise"] for r in e.studies["matrix"].rows))
+    noises = list(dict.fromkeys(r["noise"] for r in results.studies["matrix"].rows))
     for axis, panel in zip(axes, ("main", "appendix"), strict=True):
         for name in ("mean-of-annotations", "worst-of-annotations", "lcb", "uard-consistent", "uard"):
             s = [
-                e.get("matrix", "true_return", mitigation=name, size=10, trap=4.0, panel=panel, noise=z) for z in noises
+                results.get("matrix", "true_return", mitigation=name, size=10, trap=4.0, panel=panel, noise=z)
+                for z in noises
             ]
             axis.plot(range(len(noises)), [x.mean for x in s], "o-", color=COLOURS[name], lw=2, label=name)
             axis.fill_between(
@@ -84,16 +85,16 @@ def competition(e: Evidence) -> Figure:
     return figure
 
 
-def budgets(e: Evidence) -> Figure:
+def budgets(results: StudyResults) -> Figure:
     """True return against the share of steps that are rated, 10x10."""
-    rows: list[Row] = list(e.studies["budgets"].rows)
+    rows: list[Row] = list(results.studies["budgets"].rows)
     names = list(dict.fromkeys(r["mitigation"] for r in rows))
     figure, axes = axes_of(4, 3.6, 3.8)
     shown = [(p, z) for p in ("main", "appendix") for z in (0.0, 1.2)]
     for axis, (panel, level) in zip(axes, shown, strict=True):
         for name in names:
             s = [
-                e.get("budgets", "true_return", mitigation=name, panel=panel, noise=level, rated=b)
+                results.get("budgets", "true_return", mitigation=name, panel=panel, noise=level, rated=b)
                 for b in (0.01, 0.1, 1.0)
             ]
             base = (

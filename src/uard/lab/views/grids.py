@@ -9,55 +9,56 @@ from uard.lab.result import CALIBRATION
 from uard.lab.statistics import Summary
 from uard.lab.study import Row
 from uard.lab.views import figures
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.lab.views.tables import Table, brief, full, number
 
 
-def losses(e: Evidence) -> list[str]:
+def losses(results: StudyResults) -> list[str]:
     """Say where ``uard`` fails or is beaten on grids, found by rule."""
     beaten = (
-        _beaten(e, study, shown)
+        _beaten(results, study, shown)
         for study, shown in (("matrix", ("size", "trap", "panel", "noise")), ("budgets", ("panel", "noise", "rated")))
     )
-    return [_colluding(e), _missed(e), _learned(e), *beaten, *_rankings(e)]
+    return [_colluding(results), _missed(results), _learned(results), *beaten, *_rankings(results)]
 
 
-def _colluding(e: Evidence) -> str:
+def _colluding(results: StudyResults) -> str:
     """The control: who trusts raters is fooled when all of them repeat the proxy."""
-    fooled = list(e.studies["matrix"].where(mitigation="uard", panel="colluding"))
-    worst = min(e.of(r.cell, "hacks").mean / e.of(r.cell, "episode_length").mean for r in fooled)
+    fooled = list(results.studies["matrix"].where(mitigation="uard", panel="colluding"))
+    worst = min(results.of(r.cell, "hacks").mean / results.of(r.cell, "episode_length").mean for r in fooled)
     return (
         f"Colluding raters (all repeat the proxy): uard hacks in {len(fooled)} of {len(fooled)} settings, at least "
-        f"{worst:.2f} trap visits per step. It reads agreement as truth; this control must fail, and does. {_escaped(e)}"
+        f"{worst:.2f} hacks per step. It reads agreement as truth; this control must fail, and does. {_escaped(results)}"
     )
 
 
-def _escaped(e: Evidence) -> str:
+def _escaped(results: StudyResults) -> str:
     """Say who escapes colluding raters, and where most."""
     gains = []
-    for r in e.studies["matrix"].where(panel="colluding"):
-        mine = e.row("matrix", **(dict(r.labels) | {"mitigation": "uard"})).cell
-        if r["mitigation"] != "uard" and _better(e.of(r.cell, "true_return"), e.of(mine, "true_return")):
-            gains.append((e.of(r.cell, "true_return").mean - e.of(mine, "true_return").mean, r, mine))
+    for r in results.studies["matrix"].where(panel="colluding"):
+        mine = results.row("matrix", **(dict(r.labels) | {"mitigation": "uard"})).cell
+        if r["mitigation"] != "uard" and _better(results.of(r.cell, "true_return"), results.of(mine, "true_return")):
+            gains.append((results.of(r.cell, "true_return").mean - results.of(mine, "true_return").mean, r, mine))
     if not gains:
         return ""
     _, best, mine = max(gains, key=lambda g: g[0])
     return (
         f"In {len(gains)} comparisons another mitigation does better there, most of all {best['mitigation']} ({_name(best)}): "
-        f"{brief(e.of(best.cell, 'true_return'))} against {brief(e.of(mine, 'true_return'))}; very noisy raters make it shun "
+        f"{brief(results.of(best.cell, 'true_return'))} against {brief(results.of(mine, 'true_return'))}; very noisy raters make it shun "
         "whatever they rate."
     )
 
 
-def _missed(e: Evidence) -> str:
+def _missed(results: StudyResults) -> str:
     """Settings in which ``uard`` misses what is asked of it."""
     honest = [
-        r for r in e.studies["matrix"].where(mitigation="uard") if r["panel"] != "colluding" and r["noise"] <= 1.2
+        r for r in results.studies["matrix"].where(mitigation="uard") if r["panel"] != "colluding" and r["noise"] <= 1.2
     ]
     missed = [
         r
         for r in honest
-        if e.of(r.cell, "hacks").mean > (0.15 if r["noise"] == 0 else 0.2) or e.of(r.cell, "success_rate").mean < 0.98
+        if results.of(r.cell, "hacks").mean > (0.15 if r["noise"] == 0 else 0.2)
+        or results.of(r.cell, "success_rate").mean < 0.98
     ]
     named = ": " + "; ".join(_name(r) for r in missed) if missed else ""
     return (
@@ -66,10 +67,12 @@ def _missed(e: Evidence) -> str:
     )
 
 
-def _learned(e: Evidence) -> str:
+def _learned(results: StudyResults) -> str:
     """The reward that is itself a model of ratings."""
-    learned = list(e.studies["sources"].where(mitigation="uard", sources="sigma_m and sigma_h"))
-    fooled = [r for r in learned if e.of(r.cell, "hacks").mean > 1 or e.of(r.cell, "success_rate").mean < 0.95]
+    learned = list(results.studies["sources"].where(mitigation="uard", sources="sigma_m and sigma_h"))
+    fooled = [
+        r for r in learned if results.of(r.cell, "hacks").mean > 1 or results.of(r.cell, "success_rate").mean < 0.95
+    ]
     return (
         f"A reward that is itself a model of ratings (study sources): uard as recommended fails for {len(fooled)} of "
         f"{len(learned)} models: it believes a tenth of what nobody has rated, and their extrapolation is large enough for "
@@ -77,15 +80,15 @@ def _learned(e: Evidence) -> str:
     )
 
 
-def _beaten(e: Evidence, study: str, shown: tuple[str, ...]) -> str:
+def _beaten(results: StudyResults, study: str, shown: tuple[str, ...]) -> str:
     """Every setting of a study in which another mitigation has the higher true return."""
     beaten = []
-    rows = [r for r in e.studies[study].where(mitigation="uard") if r["panel"] != "colluding"]
+    rows = [r for r in results.studies[study].where(mitigation="uard") if r["panel"] != "colluding"]
     for r in rows:
         labels = {k: r[k] for k in shown}
-        mine = e.of(r.cell, "true_return")
-        for rival in e.studies[study].where(**labels):
-            if rival["mitigation"] != "uard" and _better(theirs := e.of(rival.cell, "true_return"), mine):
+        mine = results.of(r.cell, "true_return")
+        for rival in results.studies[study].where(**labels):
+            if rival["mitigation"] != "uard" and _better(theirs := results.of(rival.cell, "true_return"), mine):
                 where = ", ".join(f"{k} {v:g}" if isinstance(v, float) else f"{k} {v}" for k, v in labels.items())
                 beaten.append(f"{where}: {rival['mitigation']} {brief(theirs)} against {brief(mine)}")
     named = ": " + "; ".join(beaten) if beaten else ""
@@ -95,13 +98,15 @@ def _beaten(e: Evidence, study: str, shown: tuple[str, ...]) -> str:
     )
 
 
-def _rankings(e: Evidence) -> list[str]:
+def _rankings(results: StudyResults) -> list[str]:
     """Say who is best and second where raters are noisy."""
     out = []
     for noise in (1.2, 3.3):
         for panel in ("main", "appendix"):
-            there = e.studies["matrix"].where(size=10, trap=4.0, panel=panel, noise=noise)
-            ranking = sorted(((e.of(r.cell, "true_return"), r["mitigation"]) for r in there), key=lambda x: -x[0].mean)
+            there = results.studies["matrix"].where(size=10, trap=4.0, panel=panel, noise=noise)
+            ranking = sorted(
+                ((results.of(r.cell, "true_return"), r["mitigation"]) for r in there), key=lambda x: -x[0].mean
+            )
             (best, first), (second, runner) = ranking[:2]
             out.append(
                 f"10x10, {panel} panel, noise sd {noise:g}: highest true return {first} {full(best)}, then {runner} {full(second)}."
@@ -117,53 +122,56 @@ def _name(r: Row) -> str:
     return ", ".join(f"{k} {v}" for k, v in r.labels if k != "mitigation")
 
 
-def tables(e: Evidence) -> list[Table]:
+def tables(results: StudyResults) -> list[Table]:
     """Return all tables."""
-    matrices = (_matrix(e, metric) for metric in ("true_return", "hacks", "success_rate"))
-    return [*matrices, _twins(e), _calibration(e), _sources(e)]
+    matrices = (_matrix(results, metric) for metric in ("true_return", "hacks", "success_rate"))
+    return [*matrices, _twins(results), _calibration(results), _sources(results)]
 
 
-def pictures(e: Evidence) -> list[tuple[str, str, str]]:
+def pictures(results: StudyResults) -> list[tuple[str, str, str]]:
     """Return (title, what to see, image) of all figures."""
     return [
         (
             "Against the serious rivals",
             "Learning from pessimistic ratings is nearly as good without noise; with noise it is not.",
-            figures.data_uri(figures.competition(e)),
+            figures.data_uri(figures.competition(results)),
         ),
         (
             "Few ratings",
             "Dashed: the same rivals with our treatment of steps that nobody has rated.",
-            figures.data_uri(figures.budgets(e)),
+            figures.data_uri(figures.budgets(results)),
         ),
     ]
 
 
-def _matrix(e: Evidence, metric: str) -> Table:
-    rows = list(e.studies["matrix"].rows)
+def _matrix(results: StudyResults, metric: str) -> Table:
+    rows = list(results.studies["matrix"].rows)
     noises = list(dict.fromkeys(r["noise"] for r in rows))
     names = list(dict.fromkeys(r["mitigation"] for r in rows))
     table = []
     for panel in ("main", "appendix", "colluding"):
         for trap in (4.0, 8.0):
             for name in names:
-                s = [e.get("matrix", metric, mitigation=name, size=10, trap=trap, panel=panel, noise=z) for z in noises]
+                s = [
+                    results.get("matrix", metric, mitigation=name, size=10, trap=trap, panel=panel, noise=z)
+                    for z in noises
+                ]
                 table.append((panel, f"{trap:+g}", name, *(brief(x) for x in s)))
     columns = ("panel", "trap", "mitigation", *(f"noise {z:g}" for z in noises))
     note = "mean ± sd over seeds. Noise is the sd in reward units on every rater; divide by 4 for the fraction of a +4 trap."
     return Table(f"10x10: {metric.replace('_', ' ')} of every mitigation", columns, tuple(table), 3, note)
 
 
-def _twins(e: Evidence) -> Table:
-    names = list(dict.fromkeys(r["mitigation"] for r in e.studies["legitimate"].rows))
+def _twins(results: StudyResults) -> Table:
+    names = list(dict.fromkeys(r["mitigation"] for r in results.studies["legitimate"].rows))
     rows = []
     for size in (6, 8, 10):
         for trap in (4.0, 8.0):
             for panel in ("main", "appendix"):
-                raw = e.get("legitimate", "true_return", mitigation="raw", size=size, trap=trap, panel=panel).mean
+                raw = results.get("legitimate", "true_return", mitigation="raw", size=size, trap=trap, panel=panel).mean
                 shares = []
                 for n in names:
-                    s = e.get("legitimate", "true_return", mitigation=n, size=size, trap=trap, panel=panel)
+                    s = results.get("legitimate", "true_return", mitigation=n, size=size, trap=trap, panel=panel)
                     shares.append(f"{100 * s.mean / raw:.1f} %")
                 rows.append((f"{size}x{size}", f"{trap:+g}", panel, *shares))
     return Table(
@@ -175,12 +183,12 @@ def _twins(e: Evidence) -> Table:
     )
 
 
-def _calibration(e: Evidence) -> Table:
+def _calibration(results: StudyResults) -> Table:
     rows = []
     for panel in ("main", "appendix", "colluding"):
         for noise in (0.0, 0.3, 1.2, 3.3):
-            r = e.row("matrix", mitigation="uard", size=10, trap=4.0, panel=panel, noise=noise)
-            values = np.stack([x.extra["calibration"] for x in e.results(r.cell)]).astype(float)
+            r = results.row("matrix", mitigation="uard", size=10, trap=4.0, panel=panel, noise=noise)
+            values = np.stack([x.extra["calibration"] for x in results.results(r.cell)]).astype(float)
             rows.append(
                 (panel, f"{noise:g}", *(brief(statistics.summarise(values[:, i])) for i in range(len(CALIBRATION))))
             )
@@ -193,15 +201,15 @@ def _calibration(e: Evidence) -> Table:
     )
 
 
-def _sources(e: Evidence) -> Table:
+def _sources(results: StudyResults) -> Table:
     """Which source does the work: all models of the study together, by mitigation and source."""
     rows = []
-    kinds = dict.fromkeys((r["mitigation"], r["sources"]) for r in e.studies["sources"].rows)
+    kinds = dict.fromkeys((r["mitigation"], r["sources"]) for r in results.studies["sources"].rows)
     for name, way in kinds:
-        cells = [r.cell for r in e.studies["sources"].where(mitigation=name, sources=way)]
-        worst = max(e.of(c, "hacks").mean for c in cells)
-        solved = sum(e.of(c, "hacks").mean <= 1.0 and e.of(c, "success_rate").mean >= 0.95 for c in cells)
-        means = {m: statistics.summarise([e.of(c, m).mean for c in cells]) for m in ("hacks", "true_return")}
+        cells = [r.cell for r in results.studies["sources"].where(mitigation=name, sources=way)]
+        worst = max(results.of(c, "hacks").mean for c in cells)
+        solved = sum(results.of(c, "hacks").mean <= 1.0 and results.of(c, "success_rate").mean >= 0.95 for c in cells)
+        means = {m: statistics.summarise([results.of(c, m).mean for c in cells]) for m in ("hacks", "true_return")}
         rows.append(
             (
                 name,

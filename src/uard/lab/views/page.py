@@ -20,8 +20,8 @@ from uard.lab import studies
 from uard.lab.execution.store import Store
 from uard.lab.result import WINDOW
 from uard.lab.views import best_of_n, figures, games, grids, leaderboard, published, sections
-from uard.lab.views.evidence import Evidence
 from uard.lab.views.sections import Section
+from uard.lab.views.study_results import StudyResults
 from uard.lab.views.tables import study_table
 from uard.lab.views.templates import HERE, picture, render, table
 from uard.plugins import PluginError
@@ -48,9 +48,9 @@ def write(
         InvalidValueError: the folder cannot be written.
         LookupError: a study is not finished.
     """
-    evidence = Evidence(store, seeds, studies.find(("grid",), mitigations))
-    ours = [_ours(evidence), _games(), _best_of_n(), _made(store, len(evidence.seeds))]
-    theirs, broken = sections.of_packages(evidence, [*ours, _losses(())])
+    results = StudyResults(store, seeds, studies.find(("grid",), mitigations))
+    ours = [_ours(results), _games(), _best_of_n(), _made(store, len(results.seeds))]
+    theirs, broken = sections.of_packages(results, [*ours, _losses(())])
     every = sorted([*ours, *theirs], key=lambda s: s.order)
     every = sorted([*every, _losses(every)], key=lambda s: s.order)
     links = [(s.order, f"#{s.id}", s.label or s.title) for s in every]
@@ -58,7 +58,7 @@ def write(
         HERE,
         "page.html.j2",
         version=__version__,
-        seeds=len(evidence.seeds),
+        seeds=len(results.seeds),
         window=WINDOW,
         sections=every,
         links=[link for _, *link in sorted([*links, (_LEADERBOARD, "leaderboard.html", "Leaderboard")])],
@@ -76,15 +76,17 @@ def _losses(every: Sequence[Section]) -> Section:
     return Section("losses", "Where uard fails or is beaten", 20, f"<ul>{items}</ul>", "Where uard loses")
 
 
-def _ours(e: Evidence) -> Section:
+def _ours(results: StudyResults) -> Section:
     html = render(
         HERE,
         "ours.html.j2",
-        pictures=grids.pictures(e),
-        tables=grids.tables(e),
-        everything=[study_table(s, e) for s in e.studies.values() if s.name != "matrix"],
+        pictures=grids.pictures(results),
+        tables=grids.tables(results),
+        everything=[study_table(s, results) for s in results.studies.values() if s.name != "matrix"],
     )
-    return Section("ours", "Every mitigation, everywhere", 60, html, "Every mitigation", losses=tuple(grids.losses(e)))
+    return Section(
+        "ours", "Every mitigation, everywhere", 60, html, "Every mitigation", losses=tuple(grids.losses(results))
+    )
 
 
 def _games() -> Section:

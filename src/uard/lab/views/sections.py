@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from uard import _checks
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.plugins import Plugin, PluginError, brought
 
 PAGES = ("index.html", "leaderboard.html")  # that stand beside what sections write
@@ -51,17 +51,17 @@ class Section:
                 raise _checks.InvalidValueError("files", name, f"a plain name, none of {', '.join(PAGES)}")
 
 
-def of_packages(evidence: Evidence, ours: Iterable[Section]) -> tuple[list[Section], list[PluginError]]:
+def of_packages(results: StudyResults, ours: Iterable[Section]) -> tuple[list[Section], list[PluginError]]:
     """Return the sections that packages bring, and what of it is broken.
 
     Args:
-        evidence: What they are made from.
+        results: What they are made from.
         ours: Whose ids and files nobody else may have.
     """
     taken = {name for section in ours for name in (section.id, *section.files)}
 
     def read(plugin: Plugin) -> list[Section]:
-        made = plugin.call(evidence)
+        made = plugin.call(results)
         if not (isinstance(made, list | tuple) and all(isinstance(s, Section) for s in made)):
             raise PluginError(plugin, f"{_checks.short(made)} is no list of Section")
         new = [name for section in made for name in (section.id, *section.files)]

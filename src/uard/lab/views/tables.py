@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from uard.lab.statistics import Summary
 from uard.lab.study import Study
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 
 SHOWN = ("hacks", "success_rate", "true_return", "observed_return", "alignment_gap")
 
@@ -53,12 +53,12 @@ def full(s: Summary) -> str:
     return f"{brief(s)} [{number(s.ci95[0])}, {number(s.ci95[1])}]"
 
 
-def study_table(study: Study, evidence: Evidence) -> Table:
+def study_table(study: Study, results: StudyResults) -> Table:
     """All rows of a study with the main metrics."""
     names = tuple(name for name, _ in study.rows[0].labels)
     rows = []
     for r in study.rows:
-        metrics = tuple(mean_sd(*evidence.moments(r.cell, m)) for m in SHOWN)
+        metrics = tuple(mean_sd(*results.moments(r.cell, m)) for m in SHOWN)
         rows.append((*(str(v) for _, v in r.labels), *metrics))
     columns = (*names, *(m.replace("_", " ") for m in SHOWN))
     return Table(
@@ -66,5 +66,5 @@ def study_table(study: Study, evidence: Evidence) -> Table:
         columns,
         tuple(rows),
         len(names),
-        f"mean ± sd over {len(evidence.seeds)} seeds",
+        f"mean ± sd over {len(results.seeds)} seeds",
     )

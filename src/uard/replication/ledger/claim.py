@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from uard.lab.statistics import Summary
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.replication.paper import Stat
 from uard.replication.verdicts import Opinion, Part
 
 
-def nothing(evidence: Evidence) -> dict[str, Any]:
+def nothing(results: StudyResults) -> dict[str, Any]:
     """Return no numbers: for a claim that is about the paper's text alone."""
     return {}
 
@@ -28,7 +28,7 @@ class Conditions:
     """
 
     parts: tuple[Part | Opinion, ...]
-    numbers: Callable[[Evidence], dict[str, Any] | None] = nothing
+    numbers: Callable[[StudyResults], dict[str, Any] | None] = nothing
 
 
 def agrees(ours: Summary, printed: Stat) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 
 from uard.lab import statistics
 from uard.lab.statistics import Summary
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.replication import paper
 from uard.replication.ledger.claim import Conditions, below
 from uard.replication.ledger.filters import READINGS
@@ -18,9 +18,9 @@ from uard.replication.verdicts import Opinion, Part, each
 _PASSIVE = ("Ablation I", "Ablation II")
 
 
-def _undiscounted(e: Evidence) -> dict[str, Any]:
-    base = e.per_seed("table5", "hacks", variant="Baseline Q-Learning")
-    tests = [statistics.welch(base, e.per_seed("table5", "hacks", variant=v)) for v in _PASSIVE]
+def _undiscounted(results: StudyResults) -> dict[str, Any]:
+    base = results.per_seed("table5", "hacks", variant="Baseline Q-Learning")
+    tests = [statistics.welch(base, results.per_seed("table5", "hacks", variant=v)) for v in _PASSIVE]
     printed = {row.variant: row.visits.mean for row in paper.TABLE_5}
     return {
         "fewer": {v: t.difference for v, t in zip(_PASSIVE, tests, strict=True)},
@@ -46,9 +46,9 @@ J31 = Conditions(
 )
 
 
-def _sources(e: Evidence) -> dict[str, Any]:
+def _sources(results: StudyResults) -> dict[str, Any]:
     variants = {"lite": "No sigma_h (UARD-lite)", "human": "No sigma_m (Human-only)", "both": "UARD (Full)"}
-    return {k: e.get("table5", "hacks", variant=v, reading="uard-paper") for k, v in variants.items()}
+    return {k: results.get("table5", "hacks", variant=v, reading="uard-paper") for k, v in variants.items()}
 
 
 J32 = Conditions(
@@ -61,10 +61,10 @@ J32 = Conditions(
 )
 
 
-def _evolution(e: Evidence) -> dict[str, Any]:
-    runs = e.results(e.row("uncertainty", agent="uard-paper", panel="main", heads="bootstrapped").cell)
+def _evolution(results: StudyResults) -> dict[str, Any]:
+    runs = results.results(results.row("uncertainty", agent="uard-paper", panel="main", heads="bootstrapped").cell)
     curves = np.stack([r.extra["uncertainty"] for r in runs]).astype(float)
-    sources = _sources(e)
+    sources = _sources(results)
     return {
         "peak": statistics.summarise(curves[:, :, 0].max(1)),
         "end": statistics.summarise(curves[:, -1, 0]),
@@ -91,20 +91,20 @@ J33 = Conditions(
     _evolution,
 )
 
-_LAMBDA = {"small": 1.0, "usual": 2.0, "five": 5.0, "large": 50.0}
+_LAMBDA = {"small": 1.0, "default": 2.0, "five": 5.0, "large": 50.0}
 SENSITIVITY = {f"{name}, {size}x{size}": (reading, size) for name, reading in READINGS.items() for size in (6, 10)}
 
 
-def _sensitivity(e: Evidence) -> dict[str, Any]:
+def _sensitivity(results: StudyResults) -> dict[str, Any]:
     def at(metric: str, lam: float) -> dict[str, Summary]:
         return {
-            name: e.get("sensitivity", metric, reading=reading, size=size, lam=lam)
+            name: results.get("sensitivity", metric, reading=reading, size=size, lam=lam)
             for name, (reading, size) in SENSITIVITY.items()
         }
 
     return {
-        **{f"visits_{name}": at("hacks", _LAMBDA[name]) for name in ("small", "usual", "five")},
-        **{f"true_{name}": at("true_return", _LAMBDA[name]) for name in ("usual", "large")},
+        **{f"visits_{name}": at("hacks", _LAMBDA[name]) for name in ("small", "default", "five")},
+        **{f"true_{name}": at("true_return", _LAMBDA[name]) for name in ("default", "large")},
     }
 
 
@@ -113,7 +113,7 @@ J34 = Conditions(
         *each(
             "{}: with lambda 1 it hacks more than with 2 (intervals apart)",
             SENSITIVITY,
-            lambda n, s: below(n["visits_usual"][s], n["visits_small"][s]),
+            lambda n, s: below(n["visits_default"][s], n["visits_small"][s]),
         ),
         *each(
             "{}: with lambda 5 it makes less than one visit per episode",
@@ -123,7 +123,7 @@ J34 = Conditions(
         *each(
             "{}: with lambda 50 its true return is lower than with 2 (intervals apart)",
             SENSITIVITY,
-            lambda n, s: below(n["true_large"][s], n["true_usual"][s]),
+            lambda n, s: below(n["true_large"][s], n["true_default"][s]),
         ),
     ),
     _sensitivity,
@@ -132,23 +132,27 @@ J34 = Conditions(
 _LIMITS, _RESPONSES = ("0.25", "0.5", "1"), ("safe", "ask", "skip")
 
 
-def _deferring(e: Evidence) -> dict[str, Any]:
+def _deferring(results: StudyResults) -> dict[str, Any]:
     def visits(limit: str, response: str) -> Summary:
-        return e.get("abstention", "hacks", rule="threshold", limit=float(limit), response=response)
+        return results.get("abstention", "hacks", rule="threshold", limit=float(limit), response=response)
 
     def deferred(limit: str) -> float:
-        return float(e.curves("abstention", "abstained", rule="threshold", limit=float(limit), response="safe").mean())
+        return float(
+            results.curves("abstention", "abstained", rule="threshold", limit=float(limit), response="safe").mean()
+        )
 
-    rows = e.studies["abstention"].rows
-    best = max(rows, key=lambda r: e.of(r.cell, "true_return").mean)
-    solved = [r for r in rows if e.of(r.cell, "hacks").mean < 0.5 and e.of(r.cell, "success_rate").mean > 0.9]
+    rows = results.studies["abstention"].rows
+    best = max(rows, key=lambda r: results.of(r.cell, "true_return").mean)
+    solved = [
+        r for r in rows if results.of(r.cell, "hacks").mean < 0.5 and results.of(r.cell, "success_rate").mean > 0.9
+    ]
     return {
         "deferred": {limit: deferred(limit) for limit in _LIMITS},
         "visits": {response: visits(_LIMITS[0], response) for response in _RESPONSES},
-        "none": e.get("abstention", "hacks", rule="none"),
+        "none": results.get("abstention", "hacks", rule="none"),
         "best": f"{best['rule']} {best['limit']:g}, {best['response']}",
-        "best_true": e.of(best.cell, "true_return"),
-        "none_true": e.get("abstention", "true_return", rule="none"),
+        "best_true": results.of(best.cell, "true_return"),
+        "none_true": results.get("abstention", "true_return", rule="none"),
         "settings": len(rows) - 1,
         "solved": len(solved),
     }

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from uard.lab.views import published
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.replication import paper
 from uard.replication.ledger.claim import Conditions
 from uard.replication.ledger.tables import NINE
 from uard.replication.verdicts import each
 
 
-def _reported(e: Evidence) -> dict[str, Any]:
+def _reported(results: StudyResults) -> dict[str, Any]:
     rows = published.packaged().rows("deep-baselines", mitigation="raw")
     return {
         "reported": {name: len(where) for name, where in paper.BASELINES.items()},
@@ -28,7 +28,7 @@ J24 = Conditions(
 _KINDS = ("5 full networks", "5 heads, shared trunk")
 
 
-def _cost(e: Evidence) -> dict[str, Any] | None:
+def _cost(results: StudyResults) -> dict[str, Any] | None:
     speed = published.packaged_json("speed.json")
     if speed is None:
         return None

@@ -15,7 +15,7 @@ from uard.lab.execution import examine
 from uard.lab.statistics import Summary
 from uard.lab.study import Row
 from uard.lab.views import published
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.method.stability import DEFINITIONS
 from uard.replication import locomotion, paper, theory
 from uard.replication.ledger.claim import Conditions
@@ -57,7 +57,7 @@ def _reaction(row: Row, name: str) -> Summary:
 # --- exploit activations and adjusted rewards ---
 
 
-def _activations(e: Evidence) -> dict[str, Any] | None:
+def _activations(results: StudyResults) -> dict[str, Any] | None:
     grid, hopper = _on_grid(), _on_hopper()
     if grid is None or hopper is None:
         return None
@@ -104,7 +104,7 @@ def _times(ours: float, rival: float, ratio: float) -> bool | None:
     return rival > ratio * ours if ours > 0 else None
 
 
-def _against_sunrise(e: Evidence) -> dict[str, Any] | None:
+def _against_sunrise(results: StudyResults) -> dict[str, Any] | None:
     found, numbers = _believed("SUNRISE"), dict[str, Any](paper.FIGURES["G15"].numbers)
     return None if found is None else found | {"ratio": numbers["ratio above"]}
 
@@ -125,7 +125,7 @@ J23 = Conditions(
 )
 
 
-def _against_edac(e: Evidence) -> dict[str, Any] | None:
+def _against_edac(results: StudyResults) -> dict[str, Any] | None:
     found, numbers = _believed("EDAC"), dict[str, Any](paper.FIGURES["G14"].numbers)
     return None if found is None else found | {"gap": numbers["gap above"], "level": numbers["UARD below"]}
 
@@ -165,19 +165,19 @@ STATIC = {  # study and labels of pessimism whose strength is a constant
 ADAPTIVE = ("settings", {"variant": "as recommended"})
 
 
-def _settings(e: Evidence, study: str, labels: dict[str, Any]) -> list[Row]:
+def _settings(results: StudyResults, study: str, labels: dict[str, Any]) -> list[Row]:
     """Return a mitigation's rows on 10x10: both panels, +4 and +8, noise 0 and 1.2."""
     return [
         r
-        for r in e.studies[study].where(**labels)
+        for r in results.studies[study].where(**labels)
         if r["panel"] in PANELS and r["noise"] in (0.0, 1.2) and dict(r.labels).get("size", 10) == 10
     ]
 
 
-def _solved(e: Evidence, study: str, labels: dict[str, Any]) -> int:
+def _solved(results: StudyResults, study: str, labels: dict[str, Any]) -> int:
     """Return in how many settings there is less than one visit, and the goal in nine of ten episodes."""
-    rows = _settings(e, study, labels)
-    return sum(e.of(r.cell, "hacks").mean < FEW and e.of(r.cell, "success_rate").mean >= 0.9 for r in rows)
+    rows = _settings(results, study, labels)
+    return sum(results.of(r.cell, "hacks").mean < FEW and results.of(r.cell, "success_rate").mean >= 0.9 for r in rows)
 
 
 def _trace(row: Row) -> dict[str, np.ndarray]:
@@ -191,22 +191,22 @@ def _caution(row: Row) -> float:
     return float(np.median((walk["caution"] - walk["adjusted"])[examine.inside()]))
 
 
-def _adaptation(e: Evidence) -> dict[str, Any] | None:
+def _adaptation(results: StudyResults) -> dict[str, Any] | None:
     grid, hopper = _on_grid(), _on_hopper()
     if grid is None or hopper is None:
         return None
     rows = {"grid": grid["uard"]} | {f"Hopper, {name}": hopper[name] for name in UARDS}
     walks, here = {name: _trace(row) for name, row in rows.items()}, examine.inside()
-    lowest = _settings(e, *STATIC["the lowest rating"])
+    lowest = _settings(results, *STATIC["the lowest rating"])
     return {
         "inside": {name: float(walk["lam"][here].mean()) for name, walk in walks.items()},
         "outside": {name: float(walk["lam"][~here].mean()) for name, walk in walks.items()},
         "caution": {name: _caution(row) for name, row in rows.items()},
-        "settings": len(_settings(e, *ADAPTIVE)),
-        "solved": _solved(e, *ADAPTIVE),
-        "static_solved": {name: _solved(e, *where) for name, where in STATIC.items()},
-        "lowest_visits": max(e.of(r.cell, "hacks").mean for r in lowest),
-        "lowest_goal": min(e.of(r.cell, "success_rate").mean for r in lowest),
+        "settings": len(_settings(results, *ADAPTIVE)),
+        "solved": _solved(results, *ADAPTIVE),
+        "static_solved": {name: _solved(results, *where) for name, where in STATIC.items()},
+        "lowest_visits": max(results.of(r.cell, "hacks").mean for r in lowest),
+        "lowest_goal": min(results.of(r.cell, "success_rate").mean for r in lowest),
     }
 
 
@@ -236,7 +236,7 @@ J39 = Conditions(
 # --- sign preservation ---
 
 
-def _signs(e: Evidence) -> dict[str, Any] | None:
+def _signs(results: StudyResults) -> dict[str, Any] | None:
     hopper, p = _on_hopper(), published.packaged()
     if hopper is None:
         return None

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from uard import __version__
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.replication.ledger import (
     components,
     deep,
@@ -58,13 +58,13 @@ class Entry:
     why: str
 
 
-def entries(evidence: Evidence) -> list[Entry]:
+def entries(results: StudyResults) -> list[Entry]:
     """Return the whole ledger, tables and tests first.
 
     Raises:
         LookupError: a grid study of the paper is not in the store.
     """
-    return [entry(claim, CONDITIONS[claim].numbers(evidence)) for claim in CLAIMS]
+    return [entry(claim, CONDITIONS[claim].numbers(results)) for claim in CLAIMS]
 
 
 def entry(claim: str, numbers: dict[str, Any] | None) -> Entry:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from uard.lab.statistics import Summary
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.method.weights import ReliabilityFilter, exponential_weight, linear_weight, reciprocal_weight, wiener_weight
 from uard.replication import paper
 from uard.replication.ledger.claim import Conditions, below
@@ -24,7 +24,7 @@ def _share(true: np.ndarray) -> float:
     return float(np.mean(true))
 
 
-def _sign(e: Evidence) -> dict[str, Any]:
+def _sign(results: StudyResults) -> dict[str, Any]:
     return {"violations": int((ReliabilityFilter().score(*_draws()) < 0).sum())}
 
 
@@ -40,7 +40,7 @@ _RAISED = {  # which sigma is raised, and the filter: at the paper's parameters,
 }
 
 
-def _falling(e: Evidence) -> dict[str, Any]:
+def _falling(results: StudyResults) -> dict[str, Any]:
     mu, m, h = _draws()
 
     def falls(which: str, reliability: ReliabilityFilter) -> float:
@@ -56,7 +56,7 @@ J2 = Conditions(
 )
 
 
-def _penalised(e: Evidence) -> dict[str, Any]:
+def _penalised(results: StudyResults) -> dict[str, Any]:
     mu, m, h = _draws()
     mu, f = mu + 0.01, ReliabilityFilter()
     return {
@@ -91,10 +91,10 @@ def _jumps() -> dict[str, float]:
     return {form: float(np.abs(np.diff(np.diff(w) / np.diff(u))).max()) for form, w in weights.items()}
 
 
-def _smooth(e: Evidence) -> dict[str, Any]:
+def _smooth(results: StudyResults) -> dict[str, Any]:
     def early(form: str) -> dict[str, Summary]:
         return {
-            name: e.window("filters", "success", 1, 100, form=form, reading=reading)
+            name: results.window("filters", "success", 1, 100, form=form, reading=reading)
             for name, reading in READINGS.items()
         }
 
@@ -123,9 +123,9 @@ J4 = Conditions(
 )
 
 
-def _rivals(e: Evidence) -> dict[str, Any]:
+def _rivals(results: StudyResults) -> dict[str, Any]:
     def of(metric: str, form: str) -> dict[str, Summary]:
-        return {name: e.get("filters", metric, form=form, reading=reading) for name, reading in READINGS.items()}
+        return {name: results.get("filters", metric, form=form, reading=reading) for name, reading in READINGS.items()}
 
     jumps = _jumps()
     return {
@@ -159,7 +159,7 @@ J14 = Conditions(
 )
 
 
-def _properties(e: Evidence) -> dict[str, Any]:
+def _properties(results: StudyResults) -> dict[str, Any]:
     _, u, v = _draws()
     w, x = (np.asarray(reciprocal_weight(z, paper.LAMBDA)) for z in (u, v))
     apart = u != v
@@ -185,7 +185,7 @@ J10 = Conditions(
 )
 
 
-def _derivation(e: Evidence) -> dict[str, Any]:
+def _derivation(results: StudyResults) -> dict[str, Any]:
     kappa, u, mu = paper.LAMBDA, 1.0, 2.0
     z = kappa * u * u / (2 * mu)
     return {
@@ -211,7 +211,7 @@ J11 = Conditions(
 )
 
 
-def _wiener(e: Evidence) -> dict[str, Any]:
+def _wiener(results: StudyResults) -> dict[str, Any]:
     _, u, _ = _draws(1000)
     gain = wiener_weight(np.ones_like(u), paper.LAMBDA * u)
     return {"difference": float(np.abs(gain - reciprocal_weight(u, paper.LAMBDA)).max())}
@@ -233,7 +233,7 @@ def _slopes(x: float) -> tuple[float, float]:
     return float(np.exp(-x)), 1 / (1 + x) ** 2
 
 
-def _gradients(e: Evidence) -> dict[str, Any]:
+def _gradients(results: StudyResults) -> dict[str, Any]:
     from scipy.optimize import brentq
 
     trap = paper.LAMBDA * paper.BETA * paper.SIGMA_H_AT_TRAP

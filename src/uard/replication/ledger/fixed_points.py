@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.replication import paper, theory
 from uard.replication.ledger.claim import Conditions
 from uard.replication.ledger.tables import SIZES
@@ -14,7 +14,7 @@ from uard.replication.verdicts import Numbers, Opinion, Part, each
 SAME = 1e-6  # fixed points that differ by less are one
 
 
-def _contraction(e: Evidence) -> dict[str, Any]:
+def _contraction(results: StudyResults) -> dict[str, Any]:
     return {"frozen": theory.contraction(), "live": theory.live_expansion(), "gamma": paper.GAMMA}
 
 
@@ -30,7 +30,7 @@ J5 = Conditions(
 )
 
 
-def _unique(e: Evidence) -> dict[str, Any]:
+def _unique(results: StudyResults) -> dict[str, Any]:
     return {"frozen": theory.fixed_point_spread(), "live": theory.live_fixed_point_spread()}
 
 
@@ -50,7 +50,7 @@ CASES = tuple(
 )
 
 
-def _hacking(e: Evidence) -> dict[str, Any]:
+def _hacking(results: StudyResults) -> dict[str, Any]:
     found = {f"{t.size}x{t.size}, trap +{t.trap:g}, {t.panel}": t.critical for t in theory.critical_lambdas()}
     stopping = [x for x in found.values() if x is not None]
     return {
@@ -69,11 +69,11 @@ def _stops(n: Numbers, case: str) -> bool:
 J7 = Conditions(each("{}: at lambda = 2 the fixed point does not hack", CASES, _stops), _hacking)
 
 
-def _trade(e: Evidence) -> dict[str, Any]:
+def _trade(results: StudyResults) -> dict[str, Any]:
     bias = theory.bias()
 
     def sd(agent: str) -> dict[str, float]:
-        return {p: e.get("table4", "true_return", agent=agent, panel=p).sd for p in PANELS}
+        return {p: results.get("table4", "true_return", agent=agent, panel=p).sd for p in PANELS}
 
     return {
         "honest": bias.honest,
@@ -105,7 +105,7 @@ J8 = Conditions(
 )
 
 
-def _pessimism(e: Evidence) -> dict[str, Any]:
+def _pessimism(results: StudyResults) -> dict[str, Any]:
     hazard = theory.hazard()
     weight = theory.weight_at_trap()
     return {

@@ -8,7 +8,7 @@ import numpy as np
 
 from uard.lab import statistics
 from uard.lab.statistics import Summary
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.replication import paper
 from uard.replication.ledger.claim import Conditions, agrees, reduction
 from uard.replication.ledger.tables import SIZES
@@ -26,9 +26,9 @@ def _size(name: str) -> int:
 # --- visits, returns, gaps ---
 
 
-def _mean_rating(e: Evidence) -> dict[str, Any]:
+def _mean_rating(results: StudyResults) -> dict[str, Any]:
     labels = {"mitigation": "mean-of-annotations", "size": 6, "trap": 4.0, "noise": 0.0}
-    return {"visits": {p: e.get("matrix", "hacks", panel=p, **labels) for p in PANELS}}
+    return {"visits": {p: results.get("matrix", "hacks", panel=p, **labels) for p in PANELS}}
 
 
 J15 = Conditions(
@@ -45,9 +45,9 @@ J15 = Conditions(
 )
 
 
-def _fall(e: Evidence) -> dict[str, Any]:
-    ours = {p: e.get("table4", "hacks", agent="uard-paper", panel=p) for p in PANELS}
-    base = {p: e.get("table4", "hacks", agent="baseline", panel=p) for p in PANELS}
+def _fall(results: StudyResults) -> dict[str, Any]:
+    ours = {p: results.get("table4", "hacks", agent="uard-paper", panel=p) for p in PANELS}
+    base = {p: results.get("table4", "hacks", agent="baseline", panel=p) for p in PANELS}
     return {
         "ours": ours,
         "reduction": {p: reduction(ours[p], base[p]) for p in PANELS},
@@ -65,18 +65,21 @@ J17 = Conditions(
 )
 
 
-def _reductions(e: Evidence) -> dict[str, float]:
+def _reductions(results: StudyResults) -> dict[str, float]:
     return {
         name: reduction(
-            *(e.get("scale", "hacks", agent=a, size=_size(name), panel="main") for a in ("uard-paper", "baseline"))
+            *(
+                results.get("scale", "hacks", agent=a, size=_size(name), panel="main")
+                for a in ("uard-paper", "baseline")
+            )
         )
         for name in SIZES
     }
 
 
-def _falls(e: Evidence) -> dict[str, Any]:
+def _falls(results: StudyResults) -> dict[str, Any]:
     printed = {name: paper.PERCENT[f"hits-{name}"].value / 100 for name in SIZES[1:]}
-    return {"reduction": {name: _reductions(e)[name] for name in SIZES[1:]}, "printed": printed}
+    return {"reduction": {name: _reductions(results)[name] for name in SIZES[1:]}, "printed": printed}
 
 
 J18 = Conditions(
@@ -89,8 +92,8 @@ J18 = Conditions(
 )
 
 
-def _gap(e: Evidence) -> dict[str, Any]:
-    ours, base = (e.get("table4", "alignment_gap", agent=a, panel="appendix") for a in ("uard-paper", "baseline"))
+def _gap(results: StudyResults) -> dict[str, Any]:
+    ours, base = (results.get("table4", "alignment_gap", agent=a, panel="appendix") for a in ("uard-paper", "baseline"))
     uard = next(row for row in paper.TABLE_4 if row.agent == "UARD")
     implied = abs(uard.observed_return.mean - uard.true_return.mean)
     return {
@@ -117,9 +120,9 @@ J19 = Conditions(
 )
 
 
-def _stability(e: Evidence) -> dict[str, Any]:
+def _stability(results: StudyResults) -> dict[str, Any]:
     ours, base = (
-        e.curves("table4", "true_return", agent=a, panel="main")[:, -paper.LAST_EPISODES :].std(1, ddof=1)
+        results.curves("table4", "true_return", agent=a, panel="main")[:, -paper.LAST_EPISODES :].std(1, ddof=1)
         for a in ("uard-paper", "baseline")
     )
     numbers: dict[str, Any] = paper.FIGURES["G8"].numbers
@@ -145,11 +148,13 @@ J20 = Conditions(
 # --- when, where, at what cost ---
 
 
-def _turn(e: Evidence) -> dict[str, Any]:
+def _turn(results: StudyResults) -> dict[str, Any]:
     def goals(first: int, last: int) -> dict[str, Summary]:
-        return {p: e.window("table4", "success", first, last, agent="uard-paper", panel=p) for p in PANELS}
+        return {p: results.window("table4", "success", first, last, agent="uard-paper", panel=p) for p in PANELS}
 
-    repaired = np.convolve(e.curves("table4", "success", agent="uard", panel="main").mean(0), np.ones(10) / 10, "valid")
+    repaired = np.convolve(
+        results.curves("table4", "success", agent="uard", panel="main").mean(0), np.ones(10) / 10, "valid"
+    )
     return {
         "before": goals(201, 300),
         "late": goals(401, 500),
@@ -167,9 +172,9 @@ J26 = Conditions(
 )
 
 
-def _settled(e: Evidence) -> dict[str, Any]:
+def _settled(results: StudyResults) -> dict[str, Any]:
     def late(column: str) -> dict[str, Summary]:
-        return {p: e.window("table4", column, 200, 500, agent="uard-paper", panel=p) for p in PANELS}
+        return {p: results.window("table4", column, 200, 500, agent="uard-paper", panel=p) for p in PANELS}
 
     printed = next(row.true_return for row in paper.TABLE_4 if row.agent == "UARD")
     return {"visits": late("hacks"), "true": late("true_return"), "printed": printed}
@@ -192,13 +197,13 @@ J27 = Conditions(
 )
 
 
-def _scaling(e: Evidence) -> dict[str, Any]:
+def _scaling(results: StudyResults) -> dict[str, Any]:
     def of(metric: str, agent: str) -> dict[str, Summary]:
-        return {name: e.get("scale", metric, agent=agent, size=_size(name), panel="main") for name in SIZES}
+        return {name: results.get("scale", metric, agent=agent, size=_size(name), panel="main") for name in SIZES}
 
     base, length = of("hacks", "baseline"), of("episode_length", "baseline")
     return {
-        "reduction": _reductions(e),
+        "reduction": _reductions(results),
         "smallest": min(paper.PERCENT[name].value for name in ("hits-8x8", "hits-10x10")) / 100,
         "baseline": base,
         "per_step": {name: base[name].mean / length[name].mean for name in SIZES},
@@ -226,9 +231,9 @@ J28 = Conditions(
 )
 
 
-def _reward(e: Evidence) -> dict[str, Any]:
+def _reward(results: StudyResults) -> dict[str, Any]:
     ours, walker, best = (
-        e.get("table3", "observed_return", agent=a, horizon=100, panel="main")
+        results.get("table3", "observed_return", agent=a, horizon=100, panel="main")
         for a in ("uard-paper", "random walk", "uard")
     )
     return {"ours": ours, "walker": walker, "best": best, "printed": paper.TABLE_3[-1].reward}
@@ -246,15 +251,15 @@ J29 = Conditions(
 CELLS = {f"{size}, {panel} panel": (_size(size), panel) for size in SIZES for panel in PANELS}
 
 
-def _competence(e: Evidence) -> dict[str, Any]:
+def _competence(results: StudyResults) -> dict[str, Any]:
     def goals(agent: str) -> dict[str, Summary]:
         return {
-            name: e.get("scale", "success_rate", agent=agent, size=size, panel=panel)
+            name: results.get("scale", "success_rate", agent=agent, size=size, panel=panel)
             for name, (size, panel) in CELLS.items()
         }
 
     def true(agent: str) -> dict[str, Summary]:
-        return {p: e.get("table4", "true_return", agent=agent, panel=p) for p in PANELS}
+        return {p: results.get("table4", "true_return", agent=agent, panel=p) for p in PANELS}
 
     return {
         "goal": goals("uard-paper"),

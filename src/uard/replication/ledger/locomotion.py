@@ -6,7 +6,7 @@ from typing import Any
 
 from uard.lab.statistics import Summary
 from uard.lab.views import published
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.replication import locomotion, paper
 from uard.replication.ledger.claim import Conditions, agrees, below, reduction
 from uard.replication.ledger.grids import FEW
@@ -32,16 +32,18 @@ def _hacks(robot: str, mitigation: str) -> list[tuple[float, float]]:
     return [(ours, theirs) for ours, theirs in settings if theirs >= 1]
 
 
-def _everywhere(e: Evidence) -> dict[str, Any] | None:
+def _everywhere(results: StudyResults) -> dict[str, Any] | None:
     printed_form = {name: _hacks(robot, "uard-paper") for name, robot in ROBOTS.items()}
     repaired = [1 - ours / raw for robot in ROBOTS.values() for ours, raw in _hacks(robot, "uard")]
     if not all(printed_form.values()) or not repaired:
         return None
     ours, base, walker = (
-        e.get("table3", "hacks", agent=a, horizon=100, panel="main") for a in ("uard-paper", "baseline", "random walk")
+        results.get("table3", "hacks", agent=a, horizon=100, panel="main")
+        for a in ("uard-paper", "baseline", "random walk")
     )
     well_specified, raw = (
-        e.get("legitimate", "true_return", mitigation=m, size=10, trap=4.0, panel="main") for m in ("uard-paper", "raw")
+        results.get("legitimate", "true_return", mitigation=m, size=10, trap=4.0, panel="main")
+        for m in ("uard-paper", "raw")
     )
     kept = {name: locomotion.pooled(published.packaged(), robot, "ppo", "uard-paper") for name, robot in ROBOTS.items()}
     printed = paper.PERCENT["hacking"].value / 100
@@ -95,7 +97,7 @@ def _violations(mitigation: str, noise: float) -> dict[str, Summary] | None:
     return found
 
 
-def _noisy(e: Evidence) -> dict[str, Any] | None:
+def _noisy(results: StudyResults) -> dict[str, Any] | None:
     clean, noisy, ours = _violations("raw", 0.0), _violations("raw", 0.3), _violations("uard", 0.3)
     if clean is None or noisy is None or ours is None:
         return None
@@ -132,14 +134,14 @@ GRID = {
 }
 
 
-def _degradation(e: Evidence) -> dict[str, Any] | None:
+def _degradation(results: StudyResults) -> dict[str, Any] | None:
     ours = [_violations("uard", percent / 100) for percent in _LEVELS]
     clean, noisy = _violations("raw", 0.0), _violations("raw", 0.3)
     if clean is None or noisy is None or None in ours:
         return None
 
     def grid(agent: str, percent: int, panel: str, unit: str) -> Summary:
-        return e.get("noise", "hacks", agent=agent, panel=panel, percent=percent, unit=unit)
+        return results.get("noise", "hacks", agent=agent, panel=panel, percent=percent, unit=unit)
 
     def tabular(percent: int) -> dict[str, Summary]:
         return {"grid": grid("baseline", percent, "main", "of the trap's reward")}
@@ -179,7 +181,7 @@ J25 = Conditions(
 REGIONS = ("vibration", "posture")
 
 
-def _walking(e: Evidence) -> dict[str, Any] | None:
+def _walking(results: StudyResults) -> dict[str, Any] | None:
     p = published.packaged()
     rows = {r["region"]: r for r in p.rows(locomotion.HACKING, robot="walker2d", agent="ppo", mitigation="true reward")}
     if not set(REGIONS) <= set(rows):
@@ -210,7 +212,7 @@ J36 = Conditions(
 )
 
 
-def _worst_seed(e: Evidence) -> dict[str, Any] | None:
+def _worst_seed(results: StudyResults) -> dict[str, Any] | None:
     clean, noisy = _violations("raw", 0.0), _violations("raw", 0.3)
     if clean is None or noisy is None:
         return None

@@ -7,7 +7,7 @@ from typing import Any
 
 from uard.lab import statistics
 from uard.lab.views import published
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.replication import deep, paper
 from uard.replication.ledger.claim import Conditions, agrees
 from uard.replication.paper import Stat
@@ -20,10 +20,10 @@ def _agree(n: Numbers, setting: str, ours: str, printed: str) -> bool:
     return agrees(n[ours][setting], n[printed][setting])
 
 
-def _scale(e: Evidence) -> dict[str, Any]:
+def _scale(results: StudyResults) -> dict[str, Any]:
     def visits(agent: str) -> dict[str, Any]:
         return {
-            name: e.get("scale", "hacks", agent=agent, size=row.size, panel="main")
+            name: results.get("scale", "hacks", agent=agent, size=row.size, panel="main")
             for name, row in zip(SIZES, paper.TABLE_2, strict=True)
         }
 
@@ -54,7 +54,7 @@ def _per_episode(total: Stat) -> Stat:
     return Stat(total.mean / paper.LAST_EPISODES, total.sd / paper.LAST_EPISODES)
 
 
-def _baselines(e: Evidence) -> dict[str, Any] | None:
+def _baselines(results: StudyResults) -> dict[str, Any] | None:
     p = published.packaged()
     rows = {r["agent"]: r for r in p.rows("deep-baselines", horizon=100, mitigation="raw")}
     if not set(deep.AGENT.values()) <= set(rows):
@@ -65,7 +65,7 @@ def _baselines(e: Evidence) -> dict[str, Any] | None:
         return found | {"UARD": ours(metric, "uard-paper")}
 
     def ours(metric: str, agent: str) -> statistics.Summary:
-        return e.get("table3", metric, agent=agent, horizon=100, panel="main")
+        return results.get("table3", metric, agent=agent, horizon=100, panel="main")
 
     return {
         "visits": of("hacks"),
@@ -109,10 +109,10 @@ PERFORMANCE = {
 }
 
 
-def _performance(e: Evidence) -> dict[str, Any]:
+def _performance(results: StudyResults) -> dict[str, Any]:
     return {
         "ours": {
-            name: e.get("table4", metric, agent=agent, panel="appendix")
+            name: results.get("table4", metric, agent=agent, panel="appendix")
             for name, (agent, metric, _) in PERFORMANCE.items()
         },
         "printed": {name: stat for name, (_, _, stat) in PERFORMANCE.items()},
@@ -133,9 +133,9 @@ _VARIANTS = {
 }
 
 
-def _ablation(e: Evidence) -> dict[str, Any]:
+def _ablation(results: StudyResults) -> dict[str, Any]:
     return {
-        "ours": {name: e.get("table5", "hacks", **labels) for name, labels in _VARIANTS.items()},
+        "ours": {name: results.get("table5", "hacks", **labels) for name, labels in _VARIANTS.items()},
         "printed": {row.variant: row.visits for row in paper.TABLE_5},
     }
 
@@ -146,8 +146,8 @@ F5 = Conditions(
 )
 
 
-def _visits_test(e: Evidence) -> dict[str, Any]:
-    ours, base = (e.per_seed("table4", "hacks", agent=a, panel="appendix") for a in ("uard-paper", "baseline"))
+def _visits_test(results: StudyResults) -> dict[str, Any]:
+    ours, base = (results.per_seed("table4", "hacks", agent=a, panel="appendix") for a in ("uard-paper", "baseline"))
     student, welch = statistics.student(base, ours), statistics.welch(base, ours)
     printed = {row.agent: row.visits for row in paper.TABLE_4}
     error = ((printed["Baseline"].sd ** 2 + printed["UARD"].sd ** 2) / paper.SEEDS) ** 0.5
@@ -172,10 +172,12 @@ I1 = Conditions(
 )
 
 
-def _stability_test(e: Evidence) -> dict[str, Any]:
+def _stability_test(results: StudyResults) -> dict[str, Any]:
     from scipy import stats
 
-    ours, base = (e.per_seed("table4", "true_return", agent=a, panel="appendix") for a in ("uard-paper", "baseline"))
+    ours, base = (
+        results.per_seed("table4", "true_return", agent=a, panel="appendix") for a in ("uard-paper", "baseline")
+    )
     test = statistics.welch(ours, base)
     return {
         "difference": test.difference,
@@ -204,13 +206,13 @@ NINE = ("dqn", "ensemble-dqn", "cql", "cpo", "trpo", "sac", "edac", "sunrise", "
 RIVALS = ("tabular Q-learning", *NINE)
 
 
-def _pairwise(e: Evidence) -> dict[str, Any] | None:
+def _pairwise(results: StudyResults) -> dict[str, Any] | None:
     p = published.packaged()
     deep_rows = {r["agent"]: r for r in p.rows("deep-baselines", horizon=100, mitigation="raw")}
     if not set(NINE) <= set(deep_rows):
         return None
     ours, tabular = (
-        e.per_seed("table3", "hacks", agent=a, horizon=100, panel="main") for a in ("uard-paper", "baseline")
+        results.per_seed("table3", "hacks", agent=a, horizon=100, panel="main") for a in ("uard-paper", "baseline")
     )
     rivals = [tabular, *(p.per_seed(deep_rows[name], "hacks") for name in NINE)]
     tests = [statistics.welch(ours, rival) for rival in rivals]

@@ -11,9 +11,9 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from uard.lab.views import published
-from uard.lab.views.evidence import Evidence
 from uard.lab.views.figures import data_uri
 from uard.lab.views.sections import Section
+from uard.lab.views.study_results import StudyResults
 from uard.lab.views.tables import Table
 from uard.lab.views.templates import render, table
 from uard.replication import audit, deep, figures, ledger, locomotion
@@ -22,7 +22,7 @@ from uard.replication.report import tables, walks
 
 HERE = Path(__file__).parent
 
-FIGURES: tuple[tuple[str, str, Callable[[Evidence], Figure]], ...] = (  # title, what to see
+FIGURES: tuple[tuple[str, str, Callable[[StudyResults], Figure]], ...] = (  # title, what to see
     (
         "G2 · filters",
         "Left: the three filters. Right: goal rate by form and by where it acts. Acting on J as printed never reaches the goal, whatever the form.",
@@ -63,23 +63,23 @@ FIGURES: tuple[tuple[str, str, Callable[[Evidence], Figure]], ...] = (  # title,
 )
 
 
-def sections(evidence: Evidence) -> list[Section]:
+def sections(results: StudyResults) -> list[Section]:
     """Return all of them (entry point of ``uard.reports``).
 
     Args:
-        evidence: Of at least the grid studies, the paper's and ours.
+        results: Of at least the grid studies, the paper's and ours.
     """
-    entries = ledger.entries(evidence)
+    entries = ledger.entries(results)
     verdicts = {v: sum(e.verdict == v for e in entries) for v in ledger.VERDICTS}
     return [
-        _short(evidence, entries, verdicts),
-        _walks(evidence),
-        Section("tables", "The paper's tables beside ours", 40, _shown(tables.tables(evidence)), "The paper's tables"),
-        Section("figures", "Figures", 50, _figures(evidence)),
+        _short(results, entries, verdicts),
+        _walks(results),
+        Section("tables", "The paper's tables beside ours", 40, _shown(tables.tables(results)), "The paper's tables"),
+        Section("figures", "Figures", 50, _figures(results)),
         _deep(),
         _mujoco(),
         Section("theory", "Theorem 1", 100, _shown(tables.theory_tables())),
-        _ledger(evidence, entries, verdicts),
+        _ledger(results, entries, verdicts),
         _audit(),
     ]
 
@@ -88,20 +88,20 @@ def _shown(these: Sequence[Table]) -> str:
     return "".join(map(table, these))
 
 
-def _short(evidence: Evidence, entries: Sequence[Entry], verdicts: Mapping[str, int]) -> Section:
-    html = render(HERE, "short.html.j2", headline=tables.headline(evidence), claims=len(entries), verdicts=verdicts)
+def _short(results: StudyResults, entries: Sequence[Entry], verdicts: Mapping[str, int]) -> Section:
+    html = render(HERE, "short.html.j2", headline=tables.headline(results), claims=len(entries), verdicts=verdicts)
     return Section("short", "In short", 10, html)
 
 
-def _walks(evidence: Evidence) -> Section:
-    data = json.dumps(walks.walks(evidence)).replace("<", "\\u003c")  # nothing in it may end the element around it
-    html = render(HERE, "film.html.j2", walks=Markup(data), image=data_uri(figures.walks(evidence)))
+def _walks(results: StudyResults) -> Section:
+    data = json.dumps(walks.walks(results)).replace("<", "\\u003c")  # nothing in it may end the element around it
+    html = render(HERE, "film.html.j2", walks=Markup(data), image=data_uri(figures.walks(results)))
     css, js = _text("film.css"), _text("film.js")
     return Section("film", "What the trained agents actually do", 30, html, "What they do", css, js)
 
 
-def _figures(evidence: Evidence) -> str:
-    pictures = [(title, note, data_uri(draw(evidence))) for title, note, draw in FIGURES]
+def _figures(results: StudyResults) -> str:
+    pictures = [(title, note, data_uri(draw(results))) for title, note, draw in FIGURES]
     return render(HERE, "figures.html.j2", pictures=pictures)
 
 
@@ -118,9 +118,9 @@ def _mujoco() -> Section:
     return Section("mujoco", "Hopper and Walker2d", 80, html, "MuJoCo", losses=tuple(locomotion.losses(results)))
 
 
-def _ledger(evidence: Evidence, entries: Sequence[Entry], verdicts: Mapping[str, int]) -> Section:
+def _ledger(results: StudyResults, entries: Sequence[Entry], verdicts: Mapping[str, int]) -> Section:
     html = render(HERE, "ledger.html.j2", entries=entries, verdicts=verdicts)
-    data = json.dumps(ledger.as_data(entries, evidence.seeds), indent=2, allow_nan=False) + "\n"
+    data = json.dumps(ledger.as_data(entries, results.seeds), indent=2, allow_nan=False) + "\n"
     css, js = _text("ledger.css"), _text("ledger.js")
     return Section("ledger", "Ledger of claims", 110, html, "Ledger", css, js, files={"ledger.json": data})
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 from uard.lab.views.tables import Table, brief, full, number
 from uard.replication import paper, theory
 
 
-def headline(e: Evidence) -> list[dict[str, str]]:
+def headline(results: StudyResults) -> list[dict[str, str]]:
     """Return the four agents on 10x10 at the paper's T = 80, both panels: what a reader must see first."""
     rows = []
     for agent in ("baseline", "random walk", "uard-paper", "uard-consistent", "uard"):
@@ -15,26 +15,30 @@ def headline(e: Evidence) -> list[dict[str, str]]:
             if agent in ("baseline", "random walk") and panel == "appendix":
                 continue
             get = [
-                e.get("scale", m, agent=agent, size=10, panel=panel) for m in ("hacks", "success_rate", "true_return")
+                results.get("scale", m, agent=agent, size=10, panel=panel)
+                for m in ("hacks", "success_rate", "true_return")
             ]
             name = agent if agent in ("baseline", "random walk") else f"{agent}, {panel} panel"
             rows.append({"agent": name, "visits": full(get[0]), "goal": full(get[1]), "true": full(get[2])})
     return rows
 
 
-def tables(e: Evidence) -> list[Table]:
+def tables(results: StudyResults) -> list[Table]:
     """Return the paper's tables 2 to 5 beside ours."""
-    return [_table2(e), _table3(e), _table4(e), _table5(e)]
+    return [_table2(results), _table3(results), _table4(results), _table5(results)]
 
 
 def _stat(s: paper.Stat | None) -> str:
     return "–" if s is None else f"{s.mean:g} ± {s.sd:g}"
 
 
-def _table2(e: Evidence) -> Table:
+def _table2(results: StudyResults) -> Table:
     rows = []
     for p in paper.TABLE_2:
-        ours = [e.get("scale", "hacks", agent=a, size=p.size, panel="main") for a in ("uard-paper", "uard", "baseline")]
+        ours = [
+            results.get("scale", "hacks", agent=a, size=p.size, panel="main")
+            for a in ("uard-paper", "uard", "baseline")
+        ]
         rows.append(
             (f"{p.size}x{p.size}", _stat(p.uard), full(ours[0]), full(ours[1]), _stat(p.baseline), full(ours[2]))
         )
@@ -47,15 +51,15 @@ def _table2(e: Evidence) -> Table:
     )
 
 
-def _table3(e: Evidence) -> Table:
+def _table3(results: StudyResults) -> Table:
     rows = [
         (p.method, "paper", _stat(p.reward), _stat(p.visits), "–", "–", f"{p.reduction:g} %") for p in paper.TABLE_3
     ]
     for t in (100, 80):
-        base = e.get("table3", "hacks", agent="baseline", horizon=t, panel="main")
+        base = results.get("table3", "hacks", agent="baseline", horizon=t, panel="main")
         for agent in ("baseline", "uard-paper", "uard-consistent", "uard", "random walk"):
-            r = e.row("table3", agent=agent, horizon=t, panel="main")
-            v, o, g, true = (e.of(r.cell, m) for m in ("hacks", "observed_return", "success_rate", "true_return"))
+            r = results.row("table3", agent=agent, horizon=t, panel="main")
+            v, o, g, true = (results.of(r.cell, m) for m in ("hacks", "observed_return", "success_rate", "true_return"))
             cut = f"{100 * (1 - v.mean / base.mean):.1f} %"
             total = f"{number(100 * v.mean)} ± {number(100 * v.sd)}"
             rows.append((agent, f"ours, T = {t}", brief(o), total, brief(g), brief(true), cut))
@@ -68,7 +72,7 @@ def _table3(e: Evidence) -> Table:
     )
 
 
-def _table4(e: Evidence) -> Table:
+def _table4(results: StudyResults) -> Table:
     names = {"Baseline": "baseline", "Multi-Head": "multi-head", "UARD": "uard-paper"}
     rows = []
     for p in paper.TABLE_4:
@@ -76,10 +80,10 @@ def _table4(e: Evidence) -> Table:
             (p.agent, "paper", _stat(p.true_return), _stat(p.observed_return), _stat(p.visits), _stat(p.gap), "–")
         )
         for panel in ("main", "appendix"):
-            rows.append(_row4(e, names[p.agent], panel))
+            rows.append(_row4(results, names[p.agent], panel))
     for panel in ("main", "appendix"):
-        rows.append(_row4(e, "uard-consistent", panel))
-        rows.append(_row4(e, "uard", panel))
+        rows.append(_row4(results, "uard-consistent", panel))
+        rows.append(_row4(results, "uard", panel))
     return Table(
         "Table 4 (F4): 6x6",
         ("agent", "source", "true return", "observed return", "trap visits", "alignment gap", "goal rate"),
@@ -89,13 +93,13 @@ def _table4(e: Evidence) -> Table:
     )
 
 
-def _row4(e: Evidence, agent: str, panel: str) -> tuple[str, ...]:
-    r = e.row("table4", agent=agent, panel=panel)
+def _row4(results: StudyResults, agent: str, panel: str) -> tuple[str, ...]:
+    r = results.row("table4", agent=agent, panel=panel)
     metrics = ("true_return", "observed_return", "hacks", "alignment_gap", "success_rate")
-    return (agent, f"ours, {panel}", *(full(e.of(r.cell, m)) for m in metrics))
+    return (agent, f"ours, {panel}", *(full(results.of(r.cell, m)) for m in metrics))
 
 
-def _table5(e: Evidence) -> Table:
+def _table5(results: StudyResults) -> Table:
     rows = []
     variant = {
         "Baseline": "Baseline Q-Learning",
@@ -107,8 +111,8 @@ def _table5(e: Evidence) -> Table:
         name = variant.get(p.variant, p.variant)
         cells = []
         for reading in ("uard-paper", "uard-consistent", "uard-operator", "uard"):
-            found = list(e.studies["table5"].where(variant=name, reading=reading if p.discounting else "-"))
-            v, g = e.of(found[0].cell, "hacks"), e.of(found[0].cell, "success_rate")
+            found = list(results.studies["table5"].where(variant=name, reading=reading if p.discounting else "-"))
+            v, g = results.of(found[0].cell, "hacks"), results.of(found[0].cell, "success_rate")
             cells.append(f"{brief(v)} (goal {g.mean:.2f})")
         rows.append((p.variant, _stat(p.visits), *cells))
     return Table(

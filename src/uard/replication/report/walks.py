@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
-from uard.lab.views.evidence import Evidence
+from uard.lab.views.study_results import StudyResults
 
 
-def walks(e: Evidence) -> list[dict[str, Any]]:
+def walks(results: StudyResults) -> list[dict[str, Any]]:
     """Return greedy walks of three agents on every grid, the first three seeds."""
     out = []
     for size in (6, 8, 10):
         for panel in ("main", "appendix"):
             paths = {}
             for agent in ("baseline", "uard-paper", "uard"):
-                cell = e.row("scale", agent=agent, size=size, panel=panel).cell
-                paths[agent] = [r.path.tolist() for r in e.results(cell)[:3]]
-            grid = e.row("scale", agent="uard", size=size, panel=panel).cell.environment
+                cell = results.row("scale", agent=agent, size=size, panel=panel).cell
+                paths[agent] = [r.path.tolist() for r in results.results(cell)[:3]]
+            grid = results.row("scale", agent="uard", size=size, panel=panel).cell.environment
             out.append(
                 {
                     "name": f"{size}x{size}, {panel} panel",

@@ -80,9 +80,9 @@ def hacking(scale: Scale) -> tuple[Row, ...]:
                 rows.append(row(cell, robot=robot, region="none", agent=name, mitigation=mitigation, panel="main"))
             for which, region in REGIONS.items():
                 lies = Locomotion(robot, region=region())
-                told = Locomotion(robot, region=region(), reference=True)
+                honest = Locomotion(robot, region=region(), reference=True)
                 for label, where, mitigation, panel in (
-                    ("true reward", told, RAW, "main"),
+                    ("true reward", honest, RAW, "main"),
                     ("raw", lies, RAW, "main"),
                     *((m, lies, named(m), p) for m in ("uard-paper", "uard") for p in PANELS),
                 ):
@@ -114,7 +114,7 @@ def noise(scale: Scale) -> tuple[Row, ...]:
 
     PPO and SAC by themselves, which hear nothing of it, and with ``uard``; PPO also with what else listens to raters.
     """
-    heard = {"ppo": ("raw", "uard", *RIVALS), "sac": ("raw", "uard")}
+    compared = {"ppo": ("raw", "uard", *RIVALS), "sac": ("raw", "uard")}
     return tuple(
         row(
             _cell(Locomotion(), named(mitigation), agent, steps, noise=share * NOISE_UNIT),
@@ -123,7 +123,7 @@ def noise(scale: Scale) -> tuple[Row, ...]:
             noise=share,
         )
         for name, (agent, steps) in scale.agents.items()
-        for mitigation in heard.get(name, ())
+        for mitigation in compared.get(name, ())
         for share in (0.0, 0.1, 0.2, 0.3)
     )
 

@@ -31,7 +31,7 @@ class Trainer(ABC):
         families: Of the agents.
         at_once: Most seeds that one call trains.
         budget: What of a cell says for how long; the other field means nothing to it.
-        rating_models: How it can know of ratings, by the names of the command line, the usual way first. ``table``,
+        rating_models: How it can know of ratings, by the names of the command line, the default first. ``table``,
             which is None: running means per state-action.
         snapshots: Whether it can keep tables along the way.
         queries: How the steps that are rated may be chosen.

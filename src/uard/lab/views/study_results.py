@@ -14,7 +14,7 @@ from uard.lab.result import Result
 from uard.lab.study import Row, Study, metrics_of, results_of
 
 
-class Evidence:
+class StudyResults:
     """Finished studies over some seeds.
 
     Attributes:
