@@ -20,10 +20,10 @@ from uard.lab import registry as names
 from uard.lab.cell import Cell
 from uard.lab.execution import cluster
 from uard.lab.execution.store import Store
-from uard.lab.execution.trainers.compiled import Compiled
-from uard.lab.execution.trainers.tabular import Tabular
 from uard.lab.execution.training import train_batch
 from uard.lab.result import Result
+from uard.lab.trainers.compiled import Compiled
+from uard.lab.trainers.tabular import Tabular
 from uard.method.mitigations import named
 from uard.training.feedback.rating_model import RatingModel
 

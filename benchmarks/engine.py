@@ -28,10 +28,10 @@ from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
 from uard.lab.execution import runner
 from uard.lab.execution.store import Store
-from uard.lab.execution.trainers.tabular import Tabular
 from uard.lab.execution.training import train_batch
 from uard.lab.result import Result
 from uard.lab.study import Row, Study
+from uard.lab.trainers.tabular import Tabular
 from uard.lab.views.status import lines, status
 from uard.lab.views.study_results import StudyResults
 from uard.lab.views.tables import study_table

@@ -20,8 +20,8 @@ from uard.cli import terminal
 from uard.lab import registry as names
 from uard.lab import studies
 from uard.lab.execution.store import Store
-from uard.lab.execution.trainers.tabular import Tabular
 from uard.lab.result import METRICS, Result
+from uard.lab.trainers.tabular import Tabular
 from uard.method import mitigations as mitigation
 from uard.ratings.panels import PANELS
 

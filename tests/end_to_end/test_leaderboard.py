@@ -18,7 +18,7 @@ from uard.lab.execution.store import Store
 from uard.lab.views import leaderboard
 from uard.lab.views.leaderboard import Estimate, Line, lines, standings
 from uard.method.mitigations import named
-from uard.ratings.panels import as_panel, name_of
+from uard.ratings.panels import PANELS, as_panel
 
 GRID = TrapGrid(size=4, traps=((1, 2),), horizon=12)
 HEADS = [
@@ -118,7 +118,11 @@ def _where_of(cell):
     env = cell.environment
     name = "TrapGrid6-Legitimate" if env.legitimate else "TrapGrid"
     name = "TrapGrid6" if env.size == 6 else f"{name}, goal [3,3], horizon 12, size 4, traps [[1,2]]"
-    return name, "–" if _name(cell) == "raw" else name_of(cell.panel), cell.noise
+    return (
+        name,
+        "–" if _name(cell) == "raw" else next(name for name, panel in PANELS.items() if panel == cell.panel),
+        cell.noise,
+    )
 
 
 def test_intervals_of_many_samples_are_those_of_one(monkeypatch):

@@ -6,14 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from uard.envs.grids.gaming import (
-    ABSENT_SUPERVISOR,
-    BOAT_RACE,
-    TOMATO_WATERING,
-    AbsentSupervisor,
-    BoatRace,
-    TomatoWatering,
-)
+from uard.envs.grids.gaming import AbsentSupervisor, BoatRace, TomatoWatering
+from uard.envs.grids.layouts import ABSENT_SUPERVISOR, BOAT_RACE, TOMATO_WATERING
 from uard.envs.grids.trapgrid import TrapGrid
 
 Cell = tuple[int, int]

@@ -22,8 +22,8 @@ from uard.envs.base import Environment
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
 from uard.lab.config import FORMAT, key_of, plain, type_name
-from uard.lab.execution.trainers import TRAINERS
 from uard.lab.registry import AGENTS, CONTINUOUS, ENVIRONMENTS
+from uard.lab.trainers import TRAINERS
 from uard.method.abstention import Abstention
 from uard.method.mitigations import RatedReward, Raw, Screening, named
 from uard.ratings.panels import PANELS, Panel, Rater

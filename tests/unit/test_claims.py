@@ -15,9 +15,9 @@ from uard.lab.cell import Cell
 from uard.lab.execution import runner
 from uard.lab.execution.claims import LEASE, Owner
 from uard.lab.execution.store import Store, StoreError, record_heartbeat
-from uard.lab.execution.trainers.tabular import Tabular
 from uard.lab.execution.training import attempt
 from uard.lab.result import Result
+from uard.lab.trainers.tabular import Tabular
 
 ONE, TWO = Cell(episodes=3), Cell(episodes=4)
 JOBS = [(ONE, 0), (ONE, 1), (TWO, 0)]

@@ -20,10 +20,10 @@ from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab import registry as names
 from uard.lab import studies
 from uard.lab.cell import Cell
-from uard.lab.execution import examine, runner
 from uard.lab.execution.batching import shape_of
 from uard.lab.execution.store import Store
 from uard.lab.study import Study, row
+from uard.lab.trainers import examine, runner
 from uard.lab.views import published
 from uard.lab.views.published import BIN, Published, checkout, extract, packaged
 from uard.method.mitigations import named

@@ -16,7 +16,8 @@ from gymnasium.utils.env_checker import check_env
 
 from uard import InvalidValueError, UnknownNameError
 from uard.envs.classic.specs import Acrobot, CartPole
-from uard.envs.grids.gaming import GARDEN, HOUSE, RING, TOMATOES, AbsentSupervisor, BoatRace, TomatoWatering
+from uard.envs.grids.gaming import AbsentSupervisor, BoatRace, TomatoWatering
+from uard.envs.grids.layouts import GARDEN, HOUSE, RING, TOMATOES
 from uard.envs.grids.tomato import TomatoState
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.envs.gym import IDS, Evaluation, GridEnv, make

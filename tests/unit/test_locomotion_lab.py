@@ -25,10 +25,10 @@ from uard.lab.cell import Cell
 from uard.lab.config import FORMAT
 from uard.lab.execution import runner
 from uard.lab.execution.store import Store
-from uard.lab.execution.trainers.simulated import checkpoint_of
 from uard.lab.execution.training import packed, train_batch
 from uard.lab.result import METRICS
 from uard.lab.studies import every
+from uard.lab.trainers.simulated import checkpoint_of
 from uard.lab.views.published import Published, packaged_json
 from uard.method.mitigations import Raw, named
 from uard.ratings.panels import PANELS

@@ -41,8 +41,8 @@ from uard.lab.execution.claims import Owner
 from uard.lab.execution.format_2 import UnmappedError, new_config, new_key
 from uard.lab.execution.migrate import lines, migrate
 from uard.lab.execution.store import Store, StoreError
-from uard.lab.execution.trainers import TRAINERS
 from uard.lab.result import METRICS
+from uard.lab.trainers import TRAINERS
 from uard.lab.views.compare import compare
 from uard.lab.views.published import Published, packaged
 from uard.method.abstention import Abstention

@@ -1,9 +1,4 @@
-"""The command line, ``uard run`` and its like (``uard --help``): gathers commands, parses, and says how it ended.
-
-A command is a frozen dataclass: its fields are the options, its docstring the help, and ``run(console)`` what it does
-(``console`` is standard error). It imports what it needs when it runs. Packages bring commands of their own by entry
-points of the group ``uard.commands`` (``uard.plugins``), which are imported when no command of ours is asked for.
-"""
+"""The command line, ``uard run`` and its like (``uard --help``): parses, runs a command, and says how it ended."""
 
 from __future__ import annotations
 
@@ -11,57 +6,16 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, Union
+from typing import TYPE_CHECKING, Annotated, Any, Union
 
-from uard import __version__, _checks, plugins
+from uard import __version__, _checks
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from uard.cli.commands import Command
+
 _OF_LAB = ("jax", "jaxlib", "optax", "scipy", "tyro", "rich", "matplotlib", "jinja2")
-
-
-class Command(Protocol):
-    """What a command does."""
-
-    def run(self, console: Console) -> None:
-        """Do it; results go to standard output, the rest to ``console``.
-
-        Raises:
-            InvalidValueError: bad input, exit code 2.
-            SystemExit: with another exit code.
-        """
-
-
-@cache
-def own() -> dict[str, type[Command]]:
-    """Return our commands by name.
-
-    Raises:
-        ModuleNotFoundError: the core is installed without its laboratory.
-    """
-    from uard.cli.best_of_n import BestOfN
-    from uard.cli.compare import Compare
-    from uard.cli.doctor import Doctor
-    from uard.cli.leaderboard import Leaderboard
-    from uard.cli.list import List
-    from uard.cli.migrate import Migrate
-    from uard.cli.reproduce import Reproduce
-    from uard.cli.run import Run
-    from uard.cli.status import Status
-
-    return {
-        "run": Run,
-        "reproduce": Reproduce,
-        "doctor": Doctor,
-        "best-of-n": BestOfN,
-        "leaderboard": Leaderboard,
-        "status": Status,
-        "compare": Compare,
-        "list": List,
-        "migrate": Migrate,
-    }
 
 
 class _TerminatedError(KeyboardInterrupt):
@@ -109,6 +63,7 @@ def _parsed(arguments: list[str], console: Console) -> Command:
     import tyro
 
     from uard.cli import terminal
+    from uard.cli.commands import brought, own
 
     commands = own()
     if not (arguments and arguments[0] in commands):
@@ -119,19 +74,6 @@ def _parsed(arguments: list[str], console: Console) -> Command:
     kinds = tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in commands.items())
     union: Any = Union[kinds]  # noqa: UP007 (of as many as there are)
     return tyro.cli(union, prog="uard", args=arguments, description="Rewards that cannot be fully trusted.")
-
-
-def brought() -> tuple[dict[plugins.Plugin, type[Command]], list[plugins.PluginError]]:
-    """Return the commands of installed packages, and what of them is broken."""
-
-    def read(plugin: plugins.Plugin) -> type[Command]:
-        kind = plugin.get()
-        parameters = getattr(kind, "__dataclass_params__", None)
-        if not (isinstance(kind, type) and parameters and parameters.frozen and callable(getattr(kind, "run", None))):
-            raise plugins.PluginError(plugin, f"{_checks.short(kind)} is no frozen dataclass with a method run")
-        return kind
-
-    return plugins.brought("command", read, own())
 
 
 def _of_users() -> tuple[type[Exception], ...]:

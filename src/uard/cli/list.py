@@ -32,7 +32,7 @@ class List:
             "agents": {k: str(v) for k, v in registry.AGENTS.items()} | theirs["agent"],
             "agents for Hopper and Walker2d": {k: str(v) for k, v in registry.CONTINUOUS.items()},
             "mitigations": {k: str(mitigations.named(k)) for k in mitigations.NAMED} | theirs["mitigation"],
-            "panels": {k: (v.__doc__ or "").split("\n")[0] for k, v in PANELS.items()},
+            "panels": {k: str(v) for k, v in PANELS.items()},
             **{
                 f"studies of {group}": {s.name: f"{s.title} ({s.answers}; {len(s.rows)} cells)" for s in members}
                 for group, members in studies.groups().items()
@@ -46,7 +46,7 @@ class List:
 
 def broken() -> list[PluginError]:
     """Return an error for everything that installed packages bring and that cannot be used."""
-    from uard.cli.app import brought as commands
+    from uard.cli.commands import brought as commands
     from uard.lab import registry, studies
     from uard.lab.views import published, sections
 

@@ -1,6 +1,6 @@
 """What the configuration of an environment is: a frozen dataclass of one of three kinds.
 
-The kind says which agents can be trained in it, and how (``uard.lab.execution.trainers``): tables, a compiled world, or
+The kind says which agents can be trained in it, and how (``uard.lab.trainers``): tables, a compiled world, or
 a simulator that runs on the host.
 """
 

@@ -13,7 +13,7 @@ from uard.envs.base import Environment
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab import registry
 from uard.lab.config import key_of, plain, settled
-from uard.lab.execution.trainers import Trainer
+from uard.lab.trainers import Trainer
 from uard.method.mitigations import Mitigation, Raw
 from uard.ratings.panels import MAIN, Panel
 from uard.training.feedback.rating_model import RatingModel

@@ -18,7 +18,7 @@ from uard.agents.value import DeepQ
 from uard.envs.base import Environment
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.envs.names import ENVIRONMENTS
-from uard.lab.execution.trainers import Trainer, trainer_of
+from uard.lab.trainers import Trainer, trainer_of
 from uard.method import mitigations as mitigation
 from uard.method.abstention import Abstention
 from uard.training.feedback.rating_model import RatingModel

@@ -17,7 +17,7 @@ How a panel rates a step is a law, and an answer is drawn from it:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -77,6 +77,14 @@ class Rater:
         _checks.number("coverage", self.coverage, low=0, high=1, open_low=True)
         if self.stars is not None:
             _checks.whole("stars", self.stars, low=2, high=1000)
+
+    def __str__(self) -> str:
+        """Return the noise and what else is not the default, such as ``noise 0.1, temptation 0.6``."""
+        noise = f"noise {self.noise:g}"
+        if self.contested_noise is not None:
+            noise += f", {self.contested_noise:g} on contested steps"
+        others = [f for f in fields(self) if "noise" not in f.name and getattr(self, f.name) != f.default]
+        return ", ".join([noise, *(f"{f.name} {getattr(self, f.name):g}" for f in others)])
 
     @property
     def plain(self) -> bool:
@@ -176,6 +184,11 @@ class Panel:
         else:
             _checks.number("low", self.low)
             _checks.number("high", self.high, low=self.low, open_low=True)
+
+    def __str__(self) -> str:
+        """Return the raters, in order."""
+        count = len(self.raters)
+        return f"{count} rater{'s' * (count > 1)}: {'; '.join(map(str, self.raters))}"
 
     def law(
         self,
@@ -283,13 +296,3 @@ def as_panel(panel: str | Panel) -> Panel:
         UnknownNameError: with the nearest name.
     """
     return panel if isinstance(panel, Panel) else PANELS[_checks.choose("panel", panel, PANELS)]
-
-
-def name_of(panel: Panel) -> str:
-    """Return a panel's name if it has one, else what it is.
-
-    Examples:
-        >>> name_of(MAIN)
-        'main'
-    """
-    return next((name for name, other in PANELS.items() if other == panel), str(panel))

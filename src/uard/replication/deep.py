@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from uard.lab import statistics
-from uard.lab.execution.examine import WINDOWS
 from uard.lab.result import CALIBRATION, RATING_ERROR
 from uard.lab.study import Row
+from uard.lab.trainers.examine import WINDOWS
 from uard.lab.views.figures import COLOURS as PALETTE
 from uard.lab.views.figures import axes_of, data_uri
 from uard.lab.views.published import BIN, Published, packaged_json

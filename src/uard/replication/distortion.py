@@ -20,8 +20,8 @@ import numpy as np
 
 from uard.agents.value import DeepQ
 from uard.lab.cell import Cell
-from uard.lab.execution.examine import STEPS, backup_trust, inside
 from uard.lab.result import TABLES, Result
+from uard.lab.trainers.examine import STEPS, backup_trust, inside
 from uard.method.mitigations import Evidence, Feedback, RatedReward, RewardDiscounting
 
 BONUS = 1.5

@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from uard.lab import statistics
-from uard.lab.execution import examine
 from uard.lab.study import Row
+from uard.lab.trainers import examine
 from uard.lab.views.figures import axes_of, data_uri
 from uard.lab.views.published import Published, packaged_json
 from uard.lab.views.tables import Table, full, number

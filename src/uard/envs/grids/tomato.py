@@ -1,7 +1,7 @@
 """What happens in TomatoWatering: one set of functions for NumPy and JAX arrays.
 
-The configuration and the layout are in ``uard.envs.grids.gaming``; ``uard.envs.grids.tomato_world`` compiles these
-functions, and the Gymnasium environment calls them.
+The configuration is in ``uard.envs.grids.gaming``; ``uard.envs.grids.tomato_world`` compiles these functions, and the
+Gymnasium environment calls them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uard.envs.grids.gaming import GARDEN, TOMATOES, WATERED
+from uard.envs.grids.layouts import GARDEN, TOMATOES, WATERED
 from uard.envs.tables import HiddenTruth
 from uard.method.arrays import Array, namespace
 

@@ -11,16 +11,8 @@ import numpy as np
 
 from uard.envs.base import Environment
 from uard.envs.grids import tomato
-from uard.envs.grids.gaming import (
-    ABSENT_SUPERVISOR,
-    BOAT_RACE,
-    GARDEN,
-    TOMATO_WATERING,
-    TOMATOES,
-    AbsentSupervisor,
-    BoatRace,
-    TomatoWatering,
-)
+from uard.envs.grids.gaming import AbsentSupervisor, BoatRace, TomatoWatering
+from uard.envs.grids.layouts import ABSENT_SUPERVISOR, BOAT_RACE, GARDEN, TOMATO_WATERING, TOMATOES
 from uard.envs.grids.learned_reward import LearnedRewardGrid
 from uard.envs.grids.tomato import TomatoState
 from uard.envs.grids.trapgrid import TrapGrid

@@ -24,10 +24,10 @@ from uard.lab.execution.batching import Job, batches, shape_of
 from uard.lab.execution.claims import HEARTBEAT, Owner
 from uard.lab.execution.forecast import Forecast
 from uard.lab.execution.store import FailedSeed, Store, StoreError, record_heartbeat
-from uard.lab.execution.trainers.simulated import forget_checkpoint
 from uard.lab.execution.training import Answer
 from uard.lab.execution.workers import Claim, Engine, Outcomes, in_processes, in_this_process
 from uard.lab.result import DivergedError, Result
+from uard.lab.trainers.simulated import forget_checkpoint
 
 log = logging.getLogger(__name__)
 

@@ -1,7 +1,7 @@
 """A reward that lies to trained agents: adjusted rewards, adaptive lambda, signs of advantages (J22, J23, J39-J41, J44).
 
 The paper defines neither the distortion nor its measures: those of the grid are in ``uard.replication.distortion``,
-those of Hopper in ``uard.lab.execution.examine``.
+those of Hopper in ``uard.lab.trainers.examine``.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from uard.lab import statistics
-from uard.lab.execution import examine
 from uard.lab.statistics import Summary
 from uard.lab.study import Row
+from uard.lab.trainers import examine
 from uard.lab.views import published
 from uard.lab.views.study_results import StudyResults
 from uard.method.stability import DEFINITIONS

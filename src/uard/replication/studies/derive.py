@@ -9,8 +9,8 @@ import numpy as np
 
 from uard.envs.base import TableEnvironment
 from uard.lab.cell import Cell
-from uard.lab.execution import examine
 from uard.lab.result import TABLES, Result
+from uard.lab.trainers import examine
 from uard.method import bellman, calibration
 from uard.replication import distortion
 
@@ -49,7 +49,7 @@ def distorted(cell: Cell, found: Mapping[int, Result]) -> dict[str, Any]:
 
 
 def reactions(cell: Cell, found: Mapping[int, Result]) -> dict[str, Any]:
-    """The same of MuJoCo's agents (``uard.lab.execution.examine``)."""
+    """The same of MuJoCo's agents (``uard.lab.trainers.examine``)."""
     results = list(found.values())
     return {
         "perturbed": [r.extra["perturbed"].ravel() for r in results],

@@ -169,7 +169,7 @@ def ablation(scale: Scale) -> tuple[Row, ...]:
 
 
 def distortion(scale: Scale) -> tuple[Row, ...]:
-    """Agents trained on the true reward, whose reward is distorted afterwards (``uard.lab.execution.examine``)."""
+    """Agents trained on the true reward, whose reward is distorted afterwards (``uard.lab.trainers.examine``)."""
     honest = Locomotion(region=None, reference=True)
     every = continuous_agents(scale.small)
     full = replace(every["ensemble-sac"], ensemble=Ensemble("full", 5))

@@ -11,8 +11,8 @@ import numpy as np
 
 from uard.agents.tabular import QLearning
 from uard.envs.tables import MIN_STATES, HiddenTruth, Task
-from uard.lab.execution.trainers.base import Finish, Trainer
 from uard.lab.result import Result
+from uard.lab.trainers.base import Finish, Trainer
 from uard.method import calibration, uncertainty
 from uard.method.mitigations import Feedback, Mitigation
 

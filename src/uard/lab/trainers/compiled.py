@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from uard.envs.tables import HiddenTruth, Task
-from uard.lab.execution.trainers.base import Finish, Trainer
-from uard.lab.execution.trainers.tabular import calibration_of, place_of_tables
 from uard.lab.result import DivergedError, Result
+from uard.lab.trainers.base import Finish, Trainer
+from uard.lab.trainers.tabular import calibration_of, place_of_tables
 from uard.method import calibration
 from uard.ratings.aggregate import aggregate
 from uard.ratings.panels import draw

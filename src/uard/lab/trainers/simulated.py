@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
-from uard.lab.execution.examine import examine
-from uard.lab.execution.trainers.base import Finish, Trainer
 from uard.lab.result import Result
+from uard.lab.trainers.base import Finish, Trainer
+from uard.lab.trainers.examine import examine
 from uard.training.feedback.transition_model import QUERIES, TransitionModel
 
 if TYPE_CHECKING:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from uard.lab.execution.trainers.base import Trainer
-from uard.lab.execution.trainers.compiled import CompiledReplay, CompiledRollout
-from uard.lab.execution.trainers.simulated import SimulatedReplay, SimulatedRollout
-from uard.lab.execution.trainers.tabular import Tabular
+from uard.lab.trainers.base import Trainer
+from uard.lab.trainers.compiled import CompiledReplay, CompiledRollout
+from uard.lab.trainers.simulated import SimulatedReplay, SimulatedRollout
+from uard.lab.trainers.tabular import Tabular
 
 __all__ = ["TRAINERS", "Trainer", "trainer_of"]
 
