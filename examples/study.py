@@ -8,19 +8,20 @@ from uard.lab.execution.store import Store
 from uard.lab.result import summaries
 from uard.lab.study import results_of
 from uard.method.mitigations import named
+from uard.ratings.panels import APPENDIX
 
 SEEDS = range(5)
 
 
 def main() -> None:
     cells = {
-        (noise, mitigation): Cell(TrapGrid(6), named(mitigation), QLearning(), "appendix", noise)
+        (noise, mitigation): Cell(TrapGrid(6), named(mitigation), QLearning(), APPENDIX, noise)
         for noise in (0.0, 1.2)
         for mitigation in ("raw", "mean-of-annotations", "lcb", "uard")
     }
     store = Store(":memory:")  # a file keeps what is finished
     runner.run([(cell, seed) for cell in cells.values() for seed in SEEDS], store)
-    print(f"{'noise':>5}  {'mitigation':20} {'trap visits':>24} {'true return':>24}")
+    print(f"{'noise':>5}  {'mitigation':20} {'hacks':>24} {'true return':>24}")
     for (noise, mitigation), cell in cells.items():
         found = summaries(results_of(cell, store, SEEDS))
         shown = [f"{s.mean:.2f} [{s.ci95[0]:.2f}, {s.ci95[1]:.2f}]" for s in (found["hacks"], found["true_return"])]

@@ -335,7 +335,8 @@ def test_published_results_are_migrated_alike(old, tmp_path):
     file, cells = tmp_path / "published.json", {}
     for key, config in rows(old, "select key, config from cells"):
         seeds = rows(old, f"select seed, metrics from results where key = '{key}' order by seed")
-        metrics = {m: [json.loads(text)[m] for _, text in seeds] for m in METRICS}
+        each = [json.loads(text) for _, text in seeds]
+        metrics = {m: [numbers[m] for numbers in each] for m in each[0]}
         cells[key] = {"config": json.loads(config), "seeds": [s for s, _ in seeds], "metrics": metrics}
     cells["x"] = {"config": {"class": "uard.lab.cell.Gone"}, "seeds": [0, 1], "metrics": {}}
     file.write_text(json.dumps({"command": "made so", "results": 2, "cells": cells}))
@@ -347,6 +348,7 @@ def test_published_results_are_migrated_alike(old, tmp_path):
     assert {k: v for k, v in data.items() if k != "cells"} == {"command": "made so", "format": 3}
     assert Published((), [data]).cells == tuple(data["cells"])
     assert data["cells"].keys() == {c.key for c in CELLS}
+    assert all(cell["metrics"].keys() == set(METRICS) for cell in data["cells"].values())
     with pytest.raises(InvalidValueError, match="must be published results of format 2"):
         migrate(file)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -48,8 +48,7 @@ class _Row(NamedTuple):
 
 def train_one(run: Run, program: Program) -> TrainedAgent:
     """Train one run (pure; jit and vmap it at will)."""
-    world, agent, mitigation = run.world, run.agent, run.mitigation
-    assert isinstance(agent, OffPolicy)
+    world, agent, mitigation = run.world, cast(OffPolicy, run.agent), run.mitigation
     source = FeedbackSource(run, program)
     observe = jax.vmap(world.observe)
 

@@ -7,7 +7,7 @@ before advantages are computed from it.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -59,8 +59,7 @@ def train_one(run: Run, program: Program) -> TrainedAgent:
     together, in the order of the copies. What ends beyond ``program.episodes`` in the last rollout is dropped, though
     it was learned from. ``program.steps`` counts the steps of all copies.
     """
-    world, agent, mitigation = run.world, run.agent, run.mitigation
-    assert isinstance(agent, PolicyGradient)
+    world, agent, mitigation = run.world, cast(PolicyGradient, run.agent), run.mitigation
     source = FeedbackSource(run, program)
     copies, length = agent.envs, agent.rollout
     total = copies * length
