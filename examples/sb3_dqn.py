@@ -1,4 +1,4 @@
-"""I train with Stable-Baselines3: DQN on a grid whose traps pay, with and without the filter (about a minute)."""
+"""I train with Stable-Baselines3: DQN on a grid whose traps pay, with and without the filter (ten seconds)."""
 
 import gymnasium
 import torch
@@ -7,7 +7,7 @@ from stable_baselines3 import DQN
 import uard.envs  # noqa: F401 registers the ids
 from uard.adapters.sb3 import ReliabilityCallback, ReliabilityReplayBuffer
 
-SETTINGS = {"learning_starts": 500, "train_freq": 1, "target_update_interval": 250, "learning_rate": 1e-3, "seed": 0}
+SETTINGS = {"learning_starts": 500, "target_update_interval": 250, "learning_rate": 1e-3, "seed": 0}
 SETTINGS |= {"exploration_fraction": 0.5, "gamma": 0.95, "batch_size": 64, "policy_kwargs": {"net_arch": [64, 64]}}
 
 

@@ -8,6 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+# Processes of a test run, and the next run, share what they have compiled.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / "uard" / "xla-tests"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+
 import shapes  # noqa: F401  isort: skip  (checks the arrays of what is imported of uard after it)
 import uard.training  # noqa: F401  isort: skip  (sets XLA's flags, which must come before the first use of JAX)
 import jax
@@ -17,10 +21,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-from uard.training.xla import keep_programs
-
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-keep_programs()  # so that processes of a test run, and the next run, need not compile the same again
 
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=100)
 settings.register_profile("explore", deadline=None, max_examples=2000)

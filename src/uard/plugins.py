@@ -55,6 +55,14 @@ class PluginError(_checks.InvalidValueError):
 class Plugin:
     """One entry point.
 
+    Examples:
+        >>> entry = metadata.EntryPoint("mine", "uard.method.mitigations:Raw", "uard.mitigations")
+        >>> plugin = Plugin("mitigation", "mine", "my-package 1.0", entry)
+        >>> plugin.origin
+        'entry point mine = uard.method.mitigations:Raw of package my-package 1.0'
+        >>> plugin.call()
+        Raw()
+
     Attributes:
         kind: One of ``KINDS``.
         name: As on the command line.
@@ -124,6 +132,11 @@ def brought(
 ) -> tuple[dict[Plugin, T], list[PluginError]]:
     """Return what packages bring of a kind, and what of it is broken.
 
+    Examples:
+        >>> good, broken = brought("command", Plugin.get)
+        >>> [command.__name__ for plugin, command in good.items() if plugin.name == "ledger"]
+        ['Ledger']
+
     Args:
         kind: One of ``KINDS``.
         read: Gets what a plugin brings, checked; raises ``PluginError``.
@@ -143,6 +156,10 @@ def brought(
 
 def pick(kind: str, name: str, own: Container[str], names: list[str]) -> Plugin:
     """Return the plugin of that name.
+
+    Examples:
+        >>> pick("command", "ledger", own=("run", "list"), names=["run", "list"]).entry.value
+        'uard.replication.command:Ledger'
 
     Args:
         kind: One of ``NAMED``.

@@ -40,7 +40,8 @@ STARTER = """
 import os, signal, sys, warnings
 import jax
 from uard.cli import app as cli
-from uard.lab.execution import runner, trainers
+from uard.lab import trainers
+from uard.lab.execution import runner
 from uard.lab.execution.store import Store
 from uard.training.compiled import tabular
 from test_survival import walks

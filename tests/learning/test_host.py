@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import textwrap
 import time
 from dataclasses import replace
 
@@ -93,48 +92,56 @@ def test_a_run_that_was_stopped_goes_on_to_the_bit(agent, tmp_path):
         run(job(agent), path, "something else")
 
 
-@pytest.mark.parametrize("agent", ["ppo", "sac"])
-def test_kill_minus_nine_at_any_moment(agent, tmp_path):
-    script = tmp_path / "run.py"
-    script.write_text(
-        textwrap.dedent(f"""
-        import sys
-        from pathlib import Path
-        sys.path.insert(0, {os.path.dirname(__file__)!r})
-        import numpy as np
-        from test_host import job, run
-        from uard.training.xla import keep_programs
-        keep_programs()
-        done = run(job({agent!r}, steps=int(sys.argv[3])), Path(sys.argv[1]), "it", every=32,
-                        progress=lambda a, b: print(a, flush=True))
-        np.savez(sys.argv[2], log=done.log, evaluation=done.evaluation)
-        """)
-    )
-    path, out = tmp_path / "state", tmp_path / "out.npz"
-    steps = 8192 if agent == "ppo" else 2048
-    kills, random = 0, np.random.default_rng(0)
-    while not out.exists():
-        process = subprocess.Popen(
-            [sys.executable, str(script), str(path), str(out), str(steps)], stdout=subprocess.PIPE, text=True
-        )
-        assert process.stdout is not None
-        for _ in range(random.integers(1, 12)):  # after so many pieces of work, and a moment
-            if not process.stdout.readline():
-                break
-        if kills < 3:
-            time.sleep(random.uniform(0, 0.02))
-            process.send_signal(signal.SIGKILL)
-            kills += 1
-        else:
-            process.stdout.read()
-        process.wait()
-        process.stdout.close()
-        assert process.returncode in (0, -signal.SIGKILL)
-    whole = run(job(agent, steps=steps))
+# Starts a run per line of its input: what takes seconds, to import everything, it does once.
+STARTER = """
+import os, sys
+from pathlib import Path
+import numpy as np
+from test_host import job, run
+
+agent, steps, state, out = sys.argv[1:]
+for _ in sys.stdin:
+    pid = os.fork()
+    if not pid:
+        said = lambda *_: print("+", flush=True)
+        done = run(job(agent, steps=int(steps)), Path(state), "it", every=32, progress=said)
+        np.savez(out, log=done.log, evaluation=done.evaluation)
+        os._exit(0)
+    print(pid, flush=True)
+    print("ended", os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
+"""
+
+
+@pytest.mark.parametrize(("agent", "steps"), [("ppo", 4096), ("sac", 1024)])
+def test_kill_minus_nine_at_any_moment(agent, steps, tmp_path):
+    whole, out = run(job(agent, steps=steps)), tmp_path / "out.npz"
+    path = os.pathsep.join([os.path.dirname(__file__), *sys.path])
+    command = [sys.executable, "-W", "ignore::RuntimeWarning", "-c", STARTER]
+    random, codes = np.random.default_rng(0), []
+    with subprocess.Popen(
+        [*command, agent, str(steps), str(tmp_path / "state"), str(out)],
+        env=os.environ | {"PYTHONPATH": path},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as starter:
+        while not out.exists():
+            starter.stdin.write("start\n")
+            starter.stdin.flush()
+            pid = int(starter.stdout.readline())
+            if len(codes) < 2:
+                for _ in range(random.integers(1, 8)):  # after so many pieces of work, and a moment
+                    assert starter.stdout.readline() == "+\n"
+                time.sleep(random.uniform(0, 0.02))
+                os.kill(pid, signal.SIGKILL)
+            while not (line := starter.stdout.readline()).startswith("ended"):
+                assert line == "+\n"
+            codes.append(int(line.split()[1]))
+        starter.stdin.close()
+    assert codes == [-signal.SIGKILL] * 2 + [0]
     with np.load(out) as found:
         np.testing.assert_array_equal(found["log"], whole.log)
         np.testing.assert_array_equal(found["evaluation"], whole.evaluation)
-    assert kills == 3
 
 
 def test_half_of_what_is_rated_is_what_the_model_knows_least():

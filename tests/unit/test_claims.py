@@ -156,9 +156,9 @@ def test_a_failure_elsewhere_is_not_repeated_and_an_older_one_is(store, owner):
     store.begin(owner, 1)
     store.fail([(ONE, 0)], "old", owner)
     known = store.failures()
-    assert runner.sort_out([(ONE, 0)], store, known) == ([], [(ONE, 0)], {})
+    assert runner._sort_out([(ONE, 0)], store, known) == ([], [(ONE, 0)], {})
     store.fail([(ONE, 0)], "new", owner)
-    assert runner.sort_out([(ONE, 0)], store, known) == ([], [], {(ONE, 0): "new"})
+    assert runner._sort_out([(ONE, 0)], store, known) == ([], [], {(ONE, 0): "new"})
 
 
 def test_one_bad_cell_takes_no_other_of_its_batch_with_it(monkeypatch):

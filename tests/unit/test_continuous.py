@@ -95,7 +95,8 @@ def test_an_actor_that_climbs_a_score_of_sigma_survives_critics_that_agree_to_th
     state = agent.init(jax.random.key(0), 3, 2)
     alike = jax.tree.map(lambda x: jnp.stack([x[0], x[0]]), state.trained.critics)
     state = state._replace(trained=state.trained._replace(critics=alike), target=alike)
-    new, info = agent.update(state, batch_of(), plain(jnp.ones(32)), lambda mu, s: mu - s, jax.random.key(0))
+    batch, key = batch_of(), jax.random.key(0)
+    new, info = jax.jit(lambda s: agent.update(s, batch, plain(jnp.ones(32)), lambda mu, s: mu - s, key))(state)
     assert np.isfinite(info.loss)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(new.trained))
 
@@ -106,11 +107,11 @@ def test_an_end_has_no_future_and_a_step_of_weight_zero_teaches_nothing():
     state = agent.init(jax.random.key(0), 3, 2)
     far = batch._replace(next_observation=batch.next_observation + 100.0)
     ended = jnp.ones_like(batch.terminated)
-    a, _ = agent.update(state, batch._replace(terminated=ended), plain(jnp.ones(32)), own, jax.random.key(0))
-    b, _ = agent.update(state, far._replace(terminated=ended), plain(jnp.ones(32)), own, jax.random.key(0))
+    update = jax.jit(lambda b, w: agent.update(state, b, lambda _: (jnp.ones(32), w), own, jax.random.key(0))[0])
+    a, b = (update(rows._replace(terminated=ended), jnp.ones(32)) for rows in (batch, far))
     for x, y in zip(jax.tree.leaves(a.trained.critics), jax.tree.leaves(b.trained.critics), strict=True):
         np.testing.assert_array_equal(x, y)
-    still, _ = agent.update(state, batch, lambda s: (jnp.ones(32), jnp.zeros(32)), own, jax.random.key(0))
+    still = update(batch, jnp.zeros(32))
     for x, y in zip(jax.tree.leaves(still.trained.critics), jax.tree.leaves(state.trained.critics), strict=True):
         np.testing.assert_array_equal(x, y)
 

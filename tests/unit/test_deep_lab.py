@@ -20,12 +20,13 @@ from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab import registry as names
 from uard.lab import studies
 from uard.lab.cell import Cell
+from uard.lab.execution import runner
 from uard.lab.execution.batching import shape_of
 from uard.lab.execution.store import Store
 from uard.lab.study import Study, row
-from uard.lab.trainers import examine, runner
+from uard.lab.trainers import examine
 from uard.lab.views import published
-from uard.lab.views.published import BIN, Published, checkout, extract, packaged
+from uard.lab.views.published import BIN, Published, _checkout, extract, packaged
 from uard.method.mitigations import named
 from uard.ratings.panels import PANELS
 from uard.replication import distortion
@@ -145,7 +146,7 @@ def test_published_results_come_back_and_stale_ones_do_not():
     assert list(data["cells"]) == [cell.key]
     assert list(data["cells"][cell.key]["curves"]) == ["hacks"]
     assert back.sources[0]["command"] == "made so"
-    assert back.sources[0]["commit"] == checkout()
+    assert back.sources[0]["commit"] == _checkout()
     with pytest.raises(LookupError, match="not published"):
         back.get("deep-baselines", "hacks", agent="b")
     for older in ({"format": 1}, {"format": None, "results": 2}):
@@ -162,13 +163,13 @@ def test_the_checkout_is_named_only_where_the_code_belongs_to_it(tmp_path, monke
     code.write_text("1\n")
     git("init", "-q")
     monkeypatch.setattr(published, "__file__", str(code))
-    assert checkout() is None, "a repository around an installed package is not its own"
+    assert _checkout() is None, "a repository around an installed package is not its own"
     git("add", "code.py")
     git("commit", "-qm", "code")
     commit = git("rev-parse", "HEAD").strip()[:12]
-    assert checkout() == commit
+    assert _checkout() == commit
     code.write_text("2\n")
-    assert checkout() == f"{commit}-dirty"
+    assert _checkout() == f"{commit}-dirty"
 
 
 def test_what_is_packaged_belongs_to_the_present_definitions():

@@ -9,19 +9,18 @@ from pathlib import Path
 
 import pytest
 
-PACKAGES = ("uard.method", "uard.ratings", "uard.judges", "uard.diagnosis", "uard.adapters")
+PACKAGES = ("method", "ratings", "judges", "diagnosis", "adapters", "envs", "agents", "training", "lab")
 DOCS = Path(__file__).parents[2] / "docs"
 PARSER = doctest.DocTestParser()
 
 
 def modules():
     """All modules of the packages, by name."""
-    found = [
-        module.name
-        for package in PACKAGES
-        for module in pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}.")
-    ]
-    return {name: importlib.import_module(name) for name in [*PACKAGES, *found]}
+    names = ["uard.plugins"]
+    for package in (f"uard.{p}" for p in PACKAGES):
+        found = pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}.")
+        names += [package, *(module.name for module in found)]
+    return {name: importlib.import_module(name) for name in names}
 
 
 def members(owner):
@@ -57,14 +56,16 @@ def test_examples_run(name):
 
 
 def public():
-    """What the reference lists and the packages export."""
+    """What the reference lists, a module with all that it defines, and what the packages export."""
     pages = "\n".join(page.read_text() for page in DOCS.rglob("*.md"))
-    listed = {name for name in re.findall(r"^::: (\S+)", pages, re.M) if name.startswith(PACKAGES)}
     exporting = {name for name, module in modules().items() if hasattr(module, "__all__")}
-    for name in sorted(listed | exporting):
-        module = importlib.import_module(name)
-        names = getattr(module, "__all__", members(module))
-        yield from (f"{name}.{n}" for n in names if is_called(getattr(module, n)))
+    for name in exporting | set(re.findall(r"^::: (\S+)", pages, re.M)) - {"uard"}:
+        if name in modules():
+            module = importlib.import_module(name)
+            names = getattr(module, "__all__", members(module))
+            yield from (f"{name}.{n}" for n in names if is_called(getattr(module, n)))
+        else:
+            yield name
 
 
 def is_called(value):

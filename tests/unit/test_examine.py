@@ -12,9 +12,10 @@ from uard.envs.locomotion.locomotion import Locomotion
 from uard.envs.simulator import StepResult
 from uard.lab import studies
 from uard.lab.cell import Cell
+from uard.lab.execution import runner
 from uard.lab.execution.store import Store
 from uard.lab.study import Study, row
-from uard.lab.trainers import examine, runner
+from uard.lab.trainers import examine
 from uard.lab.views.published import Published, extract
 from uard.method.mitigations import Raw, named
 from uard.replication import locomotion

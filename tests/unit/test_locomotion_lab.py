@@ -124,14 +124,9 @@ def test_a_result_does_not_depend_on_the_number_of_cores(tmp_path):
     (tmp_path / "job").write_bytes(data)
     command = [sys.executable, "-c", TRAINED_ELSEWHERE, str(tmp_path / "job")]
     path = os.pathsep.join(sys.path)
-    elsewhere = [
-        subprocess.run(
-            command, env=os.environ | {"NPROC": n, "PYTHONPATH": path}, check=True, capture_output=True, text=True
-        )
-        for n in ("16", "1")
-    ]
-    here = hashlib.sha256(train_batch([job])[0].pack()[0]).hexdigest()
-    assert [run.stdout.strip() for run in elsewhere] == [here, here]
+    changes = {"NPROC": "16", "PYTHONPATH": path, "JAX_ENABLE_COMPILATION_CACHE": "0"}
+    elsewhere = subprocess.run(command, env=os.environ | changes, check=True, capture_output=True, text=True)
+    assert elsewhere.stdout.strip() == hashlib.sha256(train_batch([job])[0].pack()[0]).hexdigest()
 
 
 def test_a_truncated_checkpoint_fails_its_run_with_what_to_do_and_no_other(tmp_path):

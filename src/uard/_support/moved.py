@@ -45,7 +45,7 @@ MODULES = {
     "reporting.compare": "lab.views.compare",
     "reporting.deep": "replication.deep",
     "reporting.distortion": "replication.distortion",
-    "reporting.evidence": "lab.views.evidence",
+    "reporting.evidence": "lab.views.study_results",
     "reporting.figures": "replication.figures",
     "reporting.leaderboard": "lab.views.leaderboard",
     "reporting.ledger": "replication.ledger",

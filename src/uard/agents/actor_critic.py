@@ -32,23 +32,32 @@ LOG_TEMPERATURES = (-10.0, 3.0)  # beyond them Adam would only wind up
 class SoftActorCritic(OffPolicy):
     """A policy that climbs the lowest of several critics, and is paid for staying random.
 
+    Examples:
+        >>> agent = SoftActorCritic(entropy=0.5, batch=32)
+        >>> agent.family, agent.members
+        ('replay', 2)
+        >>> SoftActorCritic(tau=0.0)
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: tau = 0.0: must be a finite number in (0, 1]
+
     Attributes:
         network: Size and step size, the same for all deep agents; of the actor and of each critic.
         ensemble: The critics. Fixed random priors do not go with the lowest of them: where nothing was seen it falls by
             about their size, and the policy keeps away from what it does not know.
-        gamma: Discount in [0, 1).
+        gamma: Discount in [0, 0.9999].
         entropy: Target entropy of the first update, as a share of log A, in [0, 1]; every update multiplies it by
             ``entropy_decay``, down to ``entropy_min``. A fixed share of 0.98 [Christodoulou 2019] never settles on a
             path; a small one from the start may never find it.
-        entropy_decay: See ``entropy``.
-        entropy_min: See ``entropy``.
-        temperature: First price of entropy, in units of ``value_scale``, > 0; tuned from there.
+        entropy_decay: See ``entropy``; in [0, 1].
+        entropy_min: See ``entropy``; in [0, 1].
+        temperature: First price of entropy, in units of ``value_scale``, in (0, e^3]; tuned from there.
         diversity: EDAC's eta >= 0, the weight of the similarity between the critics' gradients.
         tau: Share in (0, 1] of the critics that each update mixes into the target network.
-        buffer: Transitions kept.
-        batch: Transitions per update; there is one update per step.
-        warmup: Steps before the first update.
-        bootstrap: Chance that a critic learns from a transition.
+        buffer: Transitions kept, >= ``batch``.
+        batch: Transitions per update, in [1, 4096]; there is one update per step.
+        warmup: Steps before the first update, >= 0.
+        bootstrap: Chance that a critic learns from a transition, in [1/256, 1].
     """
 
     network: Network = field(default_factory=Network)
@@ -66,7 +75,11 @@ class SoftActorCritic(OffPolicy):
     bootstrap: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.number("gamma", self.gamma, low=0, high=0.9999)
         for name in ("entropy", "entropy_decay", "entropy_min"):
             _checks.number(name, getattr(self, name), low=0, high=1)
@@ -191,7 +204,18 @@ class State(NamedTuple):
 
 
 def edac(members: int = 5, diversity: float = 0.01, **changes: Any) -> SoftActorCritic:
-    """Return EDAC: independent critics with diversified gradients."""
+    """Return EDAC: independent critics with diversified gradients.
+
+    Examples:
+        >>> agent = edac(members=3, batch=32)
+        >>> agent.members, agent.diversity
+        (3, 0.01)
+
+    Args:
+        members: Critics, in [1, 64]; with one there is nothing to diversify.
+        diversity: EDAC's eta >= 0.
+        **changes: Other fields of ``SoftActorCritic``.
+    """
     return SoftActorCritic(ensemble=Ensemble("full", members, 0.0), diversity=diversity, **changes)
 
 
@@ -229,6 +253,11 @@ def entropy(log_chances: Array) -> Array:
 
 def soft_value(values: Array, log_chances: Array, temperature: Array | float) -> Array:
     """Expected value plus the price of the entropy, E_pi[Q - T log pi]: (..., A) to (...) [Christodoulou 2019, eq. 4].
+
+    Examples:
+        >>> values, evenly = jnp.array([1.0, 3.0]), jnp.log(jnp.array([0.5, 0.5]))
+        >>> [round(soft_value(values, evenly, temperature).item(), 3) for temperature in (0.0, 1.0)]  # 2, 2 + log 2
+        [2.0, 2.693]
 
     Args:
         values: (..., A) of the actions.
@@ -272,6 +301,11 @@ def simplex_gradient(values: Array) -> Array:
 
 def gradient_similarity(gradients: Array, floor: float = 1e-3) -> Array:
     """EDAC's penalty: 1/(N-1) times the batch's mean of sum over k != j of cos(grad_k, grad_j), in [-N/(N-1), N].
+
+    Examples:
+        >>> alike, opposed = jnp.array([[[1.0]], [[2.0]]]), jnp.array([[[1.0]], [[-2.0]]])  # of two critics
+        >>> [round(gradient_similarity(gradients).item(), 3) for gradients in (alike, opposed)]
+        [2.0, -2.0]
 
     Args:
         gradients: (N, B, dims), of N >= 2 critics with respect to the action.

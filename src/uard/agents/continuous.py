@@ -41,23 +41,32 @@ UCB_ACTIONS = 8
 class ContinuousActorCritic(Agent):
     """A squashed normal policy that climbs its critics, and is paid for staying random.
 
+    Examples:
+        >>> agent = ContinuousActorCritic(network=Network(hidden=64), warmup=1000)
+        >>> agent.family, agent.members
+        ('continuous-replay', 2)
+        >>> ContinuousActorCritic(batch=256, warmup=100)
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: warmup = 100: must be a whole number in [256, 1e+08]
+
     Attributes:
         network: Width and step size of the actor and of each critic; unit of values.
-        ensemble: The critics, full or shared; fixed random priors only with ``pair``.
-        gamma: Discount in [0, 1).
+        ensemble: The critics, two or more, full or shared; fixed random priors only with ``pair``.
+        gamma: Discount in [0, 0.9999].
         pair: Whether the target takes the lowest of a random pair of critics and the actor their mean; else both take
             the lowest of all.
-        entropy: Target entropy, nats per motor.
-        temperature: First price of entropy, > 0; tuned from there.
+        entropy: Target entropy, nats per motor, in [-100, 100].
+        temperature: First price of entropy, in reward units, in (0, e^3]; tuned from there.
         diversity: EDAC's eta >= 0.
         conservative: CQL's alpha >= 0.
-        ucb: SUNRISE's bonus for disagreement, >= 0.
-        backup_temperature: SUNRISE's T >= 0.
+        ucb: SUNRISE's bonus for disagreement, in deviations, >= 0.
+        backup_temperature: SUNRISE's T >= 0; 0 weighs all backups alike.
         tau: Share in (0, 1] of the critics that each update mixes into the target network.
-        buffer: Transitions kept.
-        batch: Transitions per update; there is one update per step.
-        warmup: Steps of uniformly random actions before the first update.
-        bootstrap: Chance that a critic learns from a transition.
+        buffer: Transitions kept, >= ``batch``.
+        batch: Transitions per update, in [1, 65536]; there is one update per step.
+        warmup: Steps of uniformly random actions before the first update, >= ``batch``.
+        bootstrap: Chance that a critic learns from a transition, in [1/256, 1].
     """
 
     family: ClassVar[Family] = "continuous-replay"
@@ -79,7 +88,11 @@ class ContinuousActorCritic(Agent):
     bootstrap: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.number("gamma", self.gamma, low=0, high=0.9999)
         _checks.number("entropy", self.entropy, low=-100, high=100)
         _checks.number("temperature", self.temperature, low=0, high=math.exp(LOG_TEMPERATURES[1]), open_low=True)
@@ -246,27 +259,76 @@ def draw(distribution: Normal, key: Array) -> tuple[Array, Array]:
 
 
 def sac(**changes: Any) -> ContinuousActorCritic:
-    """Return SAC."""
+    """Return SAC.
+
+    Examples:
+        >>> sac(gamma=0.95).gamma, sac().members
+        (0.95, 2)
+
+    Args:
+        **changes: Fields of ``ContinuousActorCritic``.
+    """
     return ContinuousActorCritic(**changes)
 
 
 def ensemble_sac(members: int = 5, kind: Any = "shared", **changes: Any) -> ContinuousActorCritic:
-    """Return SAC with as many critics as the paper's ensembles have, no more pessimistic than with two."""
+    """Return SAC with as many critics as the paper's ensembles have, no more pessimistic than with two.
+
+    Examples:
+        >>> agent = ensemble_sac(members=3)
+        >>> agent.ensemble.kind, agent.members, agent.pair
+        ('shared', 3, True)
+
+    Args:
+        members: Critics, in [2, 64].
+        kind: ``shared`` or ``full``, see ``Ensemble``.
+        **changes: Other fields of ``ContinuousActorCritic``.
+    """
     return ContinuousActorCritic(ensemble=Ensemble(kind, members), pair=True, **changes)
 
 
 def cql(alpha: float = 1.0, **changes: Any) -> ContinuousActorCritic:
-    """Return CQL in its SAC form."""
+    """Return CQL in its SAC form.
+
+    Examples:
+        >>> cql(alpha=5.0).conservative
+        5.0
+
+    Args:
+        alpha: CQL's alpha >= 0.
+        **changes: Other fields of ``ContinuousActorCritic``.
+    """
     return ContinuousActorCritic(conservative=alpha, **changes)
 
 
 def edac(members: int = 5, diversity: float = 1.0, **changes: Any) -> ContinuousActorCritic:
-    """Return EDAC."""
+    """Return EDAC.
+
+    Examples:
+        >>> agent = edac(members=10)
+        >>> agent.ensemble.kind, agent.members, agent.diversity
+        ('full', 10, 1.0)
+
+    Args:
+        members: Critics, in [2, 64].
+        diversity: EDAC's eta >= 0.
+        **changes: Other fields of ``ContinuousActorCritic``.
+    """
     return ContinuousActorCritic(ensemble=Ensemble("full", members, 0.0), diversity=diversity, **changes)
 
 
 def sunrise(members: int = 5, **changes: Any) -> ContinuousActorCritic:
-    """Return SUNRISE; its critics share a trunk and the policy is one."""
+    """Return SUNRISE; its critics share a trunk and the policy is one.
+
+    Examples:
+        >>> agent = sunrise(members=3)
+        >>> agent.members, agent.ucb, agent.backup_temperature
+        (3, 1.0, 10.0)
+
+    Args:
+        members: Critics, in [2, 64].
+        **changes: Other fields of ``ContinuousActorCritic``.
+    """
     return ContinuousActorCritic(
         ensemble=Ensemble("shared", members), pair=True, ucb=1.0, backup_temperature=10.0, **changes
     )

@@ -43,7 +43,11 @@ class Network:
     activation: Activation = "relu"
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.whole("hidden", self.hidden, low=1, high=4096)
         _checks.number("learning_rate", self.learning_rate, low=0, high=1, open_low=True)
         _checks.number("value_scale", self.value_scale, low=0, open_low=True)
@@ -69,7 +73,11 @@ class Ensemble:
     dropout: float = 0.1
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.choose("kind", self.kind, KINDS)
         _checks.whole("members", self.members, low=1, high=64)
         _checks.number("prior_scale", self.prior_scale, low=0)

@@ -48,12 +48,21 @@ ScoreFn = Callable[[Array, Array, Array], Array]
 class OffPolicy(Agent):
     """A learner from a replay buffer, with discrete actions; its methods are pure.
 
+    Examples:
+        >>> import jax
+        >>> from uard.agents.networks import Ensemble
+        >>> from uard.agents.value import DeepQ
+        >>> agent, key = DeepQ(ensemble=Ensemble("full", members=3)), jax.random.key(0)
+        >>> state = jax.eval_shape(lambda: agent.init(key, features=4, actions=2))  # shapes only
+        >>> jax.eval_shape(agent.values, state, jax.numpy.zeros((5, 4)), key).shape
+        (3, 5, 2)
+
     Attributes:
         network: Gives the unit of values.
-        buffer: Transitions kept.
-        batch: Transitions per update.
-        warmup: Steps before the first update.
-        bootstrap: Chance that a member learns from a transition.
+        buffer: Transitions kept, >= ``batch``.
+        batch: Transitions per update, >= 1.
+        warmup: Steps before the first update, >= 0.
+        bootstrap: Chance that a member learns from a transition, in [0, 1].
     """
 
     family: ClassVar[Family] = "replay"
@@ -78,11 +87,11 @@ class OffPolicy(Agent):
 
     @abstractmethod
     def act(self, state: Any, observation: Array, score_fn: ScoreFn, episode: Array, key: Array) -> Array:
-        """Return an exploring action for one observation (features,) in the given episode (0-based)."""
+        """Return an exploring action, () int32, for one observation (features,) in the given episode (0-based)."""
 
     @abstractmethod
     def greedy(self, state: Any, observation: Array, score_fn: ScoreFn, key: Array) -> Array:
-        """Return the action without exploration."""
+        """Return the action without exploration, () int32."""
 
     @abstractmethod
     def update(

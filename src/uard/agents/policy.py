@@ -105,16 +105,24 @@ class Costs(NamedTuple):
 class PolicyGradient(Agent):
     """What PPO, TRPO and CPO share.
 
+    Examples:
+        >>> agent, key = PPO(ensemble=Ensemble("full", members=3)), jax.random.key(0)
+        >>> state = jax.eval_shape(lambda: agent.init(key, features=4, actions=2))  # shapes only
+        >>> jax.eval_shape(agent.act, state, jnp.zeros((5, 4)), key).shape
+        (5,)
+        >>> jax.eval_shape(agent.values, state, jnp.zeros((5, 4)), key).shape
+        (3, 5)
+
     Attributes:
         network: Size of the policy and of the critic, Adam's step size, unit of values.
         ensemble: The critic: how many estimates of V, and of which kind. sigma_m of a step is how much they differ on
             the state it leads to, discounted.
-        gamma: Discount in [0, 1).
+        gamma: Discount in [0, 0.9999].
         gae_lambda: Lambda of the generalised advantage estimate, in [0, 1].
-        envs: Copies of the world that are stepped side by side.
-        rollout: Steps of each copy between updates.
-        epochs: Passes over a rollout per update (TRPO and CPO: of the critic only).
-        minibatches: Parts of a pass, one step of Adam each.
+        envs: Copies of the world that are stepped side by side, in [1, 4096].
+        rollout: Steps of each copy between updates, in [1, 65536].
+        epochs: Passes over a rollout per update (TRPO and CPO: of the critic only), in [1, 1000].
+        minibatches: Parts of a pass, one step of Adam each, in [1, ``envs`` times ``rollout``].
         max_grad_norm: The gradients of the policy and of the critic are each scaled down to this, > 0.
         count_bonus: Added to the reward after the mitigation, over the root of the visits of the state-action; in
             reward units, >= 0 [Strehl and Littman 2008]. With it all of ten PPO runs arrive on the 10x10 grid; without
@@ -135,7 +143,11 @@ class PolicyGradient(Agent):
     count_bonus: float = 0.5
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.number("gamma", self.gamma, low=0, high=0.9999)
         _checks.number("gae_lambda", self.gae_lambda, low=0, high=1)
         _checks.whole("envs", self.envs, low=1, high=4096)
@@ -248,11 +260,20 @@ class PolicyGradient(Agent):
 @final
 @dataclass(frozen=True)
 class PPO(PolicyGradient):
-    """Proximal policy optimisation.
+    """Proximal policy optimisation; it has the fields of ``PolicyGradient``, too.
+
+    Examples:
+        >>> agent = PPO(clip=0.1, envs=4)
+        >>> agent.family, agent.rollout
+        ('rollout', 32)
+        >>> PPO(envs=1, rollout=8, minibatches=16)
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: minibatches = 16: must be a whole number in [1, 8]
 
     Attributes:
         clip: How far a probability may move from the old one before its step stops counting, as a share of it, in
-            (0, 1).
+            (0, 0.99].
         entropy: Bonus for the policy's entropy (nats), >= 0, in units of the standardised advantage.
     """
 
@@ -260,7 +281,11 @@ class PPO(PolicyGradient):
     entropy: float = 0.01
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         super().__post_init__()
         _checks.number("clip", self.clip, low=0, high=0.99, open_low=True)
         _checks.number("entropy", self.entropy, low=0)
@@ -294,11 +319,11 @@ class TrustRegion(PolicyGradient):
     """What TRPO and CPO share: a step of the policy within a trust region; the critic is fitted by Adam after it.
 
     Attributes:
-        delta: Largest mean KL divergence of the new policy from the old one (nats), > 0 (E11).
+        delta: Largest mean KL divergence of the new policy from the old one (nats), in (0, 100] (E11).
         damping: Added to the diagonal of the Fisher matrix, > 0.
-        conjugate_steps: Iterations of the conjugate gradient.
-        backtracks: Steps that the line search tries.
-        shrink: Each is this times the one before, in (0, 1).
+        conjugate_steps: Iterations of the conjugate gradient, in [1, 1000].
+        backtracks: Steps that the line search tries, in [1, 1000].
+        shrink: Each is this times the one before, in (0, 0.99].
     """
 
     delta: float = 0.01
@@ -308,7 +333,11 @@ class TrustRegion(PolicyGradient):
     shrink: float = 0.8
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         super().__post_init__()
         _checks.number("delta", self.delta, low=0, high=100, open_low=True)
         _checks.number("damping", self.damping, low=0, open_low=True)
@@ -320,7 +349,16 @@ class TrustRegion(PolicyGradient):
 @final
 @dataclass(frozen=True)
 class TRPO(TrustRegion):
-    """Trust-region policy optimisation."""
+    """Trust-region policy optimisation; its fields are those of ``PolicyGradient`` and ``TrustRegion``.
+
+    Examples:
+        >>> TRPO(delta=0.02).damping
+        0.1
+        >>> TRPO(delta=0.0)
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: delta = 0.0: must be a finite number in (0, 100]
+    """
 
     def update(self, state: State, experience: Experience, key: Array) -> tuple[State, UpdateInfo]:
         """Take one step of the policy, then fit the critic."""
@@ -363,6 +401,16 @@ class CPO(TrustRegion):
     The budget is kept per step: cost per step <= ``limit`` times episodes per step. The paper's discounted cost
     advantages stand in for undiscounted ones.
 
+    It has the fields of ``PolicyGradient`` and ``TrustRegion``, too.
+
+    Examples:
+        >>> CPO(limit=1.0).needs_cost, CPO(oracle=False).needs_cost
+        (True, False)
+        >>> CPO(limit=-1.0)
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: limit = -1.0: must be a finite number >= 0
+
     Attributes:
         limit: Largest mean cost of an episode, >= 0.
         oracle: Whether hacks cost 1 each; see the warning.
@@ -372,7 +420,11 @@ class CPO(TrustRegion):
     oracle: bool = True
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         super().__post_init__()
         _checks.number("limit", self.limit, low=0)
 
@@ -468,7 +520,12 @@ def gae(
     gamma: Array | float,
     lam: Array | float,
 ) -> Array:
-    """Generalised advantage estimate [Schulman et al. 2016, eq. 16] of (T, ...) steps.
+    """Generalised advantage estimate [Schulman et al. 2016, eq. 16] of (T, ...) steps; (T, ...).
+
+    Examples:
+        >>> zeros, ends = jnp.zeros(3), jnp.array([False, False, True])
+        >>> gae(jnp.ones(3), zeros, zeros, ends, ends, gamma=0.5, lam=1.0).tolist()
+        [1.75, 1.5, 1.0]
 
     Args:
         reward: (T, ...).
@@ -476,8 +533,8 @@ def gae(
         next_values: (T, ...), V of the states that the steps led to, also where an episode was cut off.
         terminated: (T, ...), where nothing follows.
         done: (T, ...), where the next row belongs to another episode.
-        gamma: Discount.
-        lam: Lambda.
+        gamma: Discount, in [0, 1].
+        lam: Lambda, in [0, 1].
     """
     delta = reward + jnp.where(terminated, 0.0, gamma * next_values) - values
 
@@ -497,7 +554,19 @@ def standardised(advantage: Array, weight: Array) -> Array:
 
 
 def clipped_surrogate(log_ratio: Array, advantage: Array, clip: Array | float) -> Array:
-    """PPO's min(ratio A, clip(ratio, 1 - clip, 1 + clip) A) [Schulman et al. 2017, eq. 7], elementwise."""
+    """PPO's min(ratio A, clip(ratio, 1 - clip, 1 + clip) A) [Schulman et al. 2017, eq. 7], elementwise.
+
+    Examples:
+        >>> doubled = jnp.log(jnp.array([2.0, 2.0]))
+        >>> gain = clipped_surrogate(doubled, advantage=jnp.array([1.0, -1.0]), clip=0.2)
+        >>> [round(x, 3) for x in gain.tolist()]  # a gain stops to count, a loss does not
+        [1.2, -2.0]
+
+    Args:
+        log_ratio: Log of an action's new probability over its old one, any shape.
+        advantage: A, of the same shape.
+        clip: In (0, 1).
+    """
     ratio = jnp.exp(log_ratio)
     return jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage)
 
@@ -525,7 +594,19 @@ def fisher_product(
 
 
 def conjugate_gradient(product: Callable[[Array], Array], b: Array, steps: int) -> Array:
-    """Solve A x = b for a symmetric positive A, given as v -> A v; stops moving when the residual is rounding."""
+    """Solve A x = b for a symmetric positive A, given as v -> A v; stops moving when the residual is rounding.
+
+    Examples:
+        >>> matrix = jnp.array([[2.0, 1.0], [1.0, 3.0]])
+        >>> x = conjugate_gradient(lambda v: matrix @ v, jnp.array([4.0, 7.0]), steps=2)
+        >>> [round(each, 3) for each in x.tolist()]
+        [1.0, 2.0]
+
+    Args:
+        product: v -> A v, of vectors (P,).
+        b: (P,).
+        steps: Most iterations; P are enough but for rounding.
+    """
     small = 1e-10 * (b @ b)
 
     def one(_: int, c: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
@@ -545,6 +626,22 @@ def constrained_step(q: Array, r: Array, s: Array, excess: Array, delta: Array |
     """Solve CPO's problem by its dual [Achiam et al. 2017, theorem 2].
 
     Maximise g'x subject to b'x + excess <= 0 and x'Hx <= 2 delta, where q = g'H^-1 g, r = g'H^-1 b, s = b'H^-1 b.
+
+    Examples:
+        >>> q, r, s = jnp.float32(2.0), jnp.float32(1.0), jnp.float32(1.0)
+        >>> for excess in (-10.0, 0.0, 2.0):  # the budget is far, used up, out of reach
+        ...     along, against, feasible = constrained_step(q, r, s, jnp.float32(excess), delta=1.0)
+        ...     print(round(along.item(), 3), round(against.item(), 3), feasible.item())
+        1.0 0.0 True
+        1.414 1.414 True
+        0.0 1.414 False
+
+    Args:
+        q: See above, >= 0; () as all that follow.
+        r: See above.
+        s: See above, >= 0; 0 where nothing that is done changes the cost.
+        excess: By how much the old policy's cost is above the budget.
+        delta: Half the squared radius of the trust region, > 0.
 
     Returns:
         (along, against, feasible): x = along H^-1 g - against H^-1 b. If no x meets both conditions (``feasible`` is

@@ -24,16 +24,25 @@ from uard.method.abstention import Abstention
 class QLearning(Agent):
     """Tabular Q-learning; the defaults are the paper's (E1-E9) where it states them.
 
+    Examples:
+        >>> baseline = QLearning(heads=1, epsilon_decay=0.99)
+        >>> baseline.family, baseline.learning_rate
+        ('tabular', 0.1)
+        >>> QLearning(learning_rate=0.0)
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: learning_rate = 0.0: must be a finite number in (0, 1]
+
     Attributes:
-        heads: Number of Q-tables N; 1 is the paper's baseline.
+        heads: Number of Q-tables N, in [1, 64]; 1 is the paper's baseline.
         learning_rate: Step size in (0, 1].
-        gamma: Discount in [0, 1).
-        epsilon: Exploration rate of the first episode.
-        epsilon_decay: Its factor per episode.
-        epsilon_min: Its floor.
-        bootstrap: Chance that a head learns from a step (resolution 1/256). The paper does not say; with 1 the heads
-            differ by their initial values only.
-        init_scale: Initial values are uniform in +-init_scale.
+        gamma: Discount in [0, 0.9999].
+        epsilon: Exploration rate of the first episode, in [0, 1].
+        epsilon_decay: Its factor per episode, in [0, 1].
+        epsilon_min: Its floor, in [0, 1].
+        bootstrap: Chance that a head learns from a step, in [1/256, 1] (resolution 1/256); 1 for a single head. The
+            paper does not say; with 1 the heads differ by their initial values only.
+        init_scale: Initial values are uniform in +-init_scale, in reward units, >= 0.
         abstention: When to defer (A42, A43), if ever.
     """
 
@@ -50,7 +59,11 @@ class QLearning(Agent):
     abstention: Abstention | None = None
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.whole("heads", self.heads, low=1, high=64)
         _checks.number("learning_rate", self.learning_rate, low=0, high=1, open_low=True)
         _checks.number("gamma", self.gamma, low=0, high=0.9999)

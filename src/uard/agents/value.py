@@ -29,19 +29,28 @@ from uard.agents.off_policy import Backup, OffPolicy, RewardFn, ScoreFn, Transit
 class DeepQ(OffPolicy):
     """Deep Q-learning with an ensemble; the defaults are DQN's and the paper's (E2-E9) where it states them.
 
+    Examples:
+        >>> sunrise = DeepQ(ensemble=Ensemble("full", members=5), ucb=1.0, temperature=10.0)
+        >>> sunrise.members, DeepQ(conservative=1.0).members  # the latter is CQL
+        (5, 1)
+        >>> DeepQ(batch=64, buffer=10)
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: buffer = 10: must be a whole number in [64, 1e+07]
+
     Attributes:
         network: Size and step size, the same for all deep agents.
         ensemble: How many members, and of which kind.
-        gamma: Discount in [0, 1).
-        epsilon: Exploration rate of the first episode; every episode multiplies it by ``epsilon_decay``, down to
-            ``epsilon_min``.
-        epsilon_decay: See ``epsilon``.
-        epsilon_min: See ``epsilon``.
-        buffer: Transitions kept.
-        batch: Transitions per update; there is one update per step.
-        warmup: Steps before the first update.
-        target_every: Updates between copies into the target network.
-        bootstrap: Chance that a member learns from a transition.
+        gamma: Discount in [0, 0.9999].
+        epsilon: Exploration rate of the first episode, in [0, 1]; every episode multiplies it by ``epsilon_decay``,
+            down to ``epsilon_min``.
+        epsilon_decay: See ``epsilon``; in [0, 1].
+        epsilon_min: See ``epsilon``; in [0, 1].
+        buffer: Transitions kept, >= ``batch``.
+        batch: Transitions per update, in [1, 4096]; there is one update per step.
+        warmup: Steps before the first update, >= 0.
+        target_every: Updates between copies into the target network, >= 1.
+        bootstrap: Chance that a member learns from a transition, in [1/256, 1]; 1 for a single member.
         conservative: CQL's alpha >= 0.
         ucb: SUNRISE's exploration bonus >= 0, in deviations.
         temperature: SUNRISE's temperature of backup weights >= 0; 0 weighs all alike.
@@ -63,7 +72,11 @@ class DeepQ(OffPolicy):
     temperature: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.number("gamma", self.gamma, low=0, high=0.9999)
         for name in ("epsilon", "epsilon_decay", "epsilon_min"):
             _checks.number(name, getattr(self, name), low=0, high=1)
@@ -172,6 +185,11 @@ class State(NamedTuple):
 
 def conservative_gap(values: Array, action: Array) -> Array:
     """CQL's gap: log sum exp of the values over the actions, less the value of the action taken; (N, B), > 0.
+
+    Examples:
+        >>> values = jnp.log(jnp.array([[[1.0, 3.0]]]))  # of one member, one observation, two actions
+        >>> round(conservative_gap(values, jnp.array([1])).item(), 3)  # log 4 - log 3
+        0.288
 
     Args:
         values: (N, B, A).

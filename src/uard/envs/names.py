@@ -51,9 +51,22 @@ KINDS: dict[str, tuple[type[Environment], dict[str, Any]]] = {
 def build(name: str, **changes: Any) -> Environment:
     """Return an environment by name, some of its fields changed.
 
+    Examples:
+        >>> build("TrapGrid6", trap_reward=8.0).trap_reward
+        8.0
+        >>> build("Trapgrid6")
+        Traceback (most recent call last):
+            ...
+        uard._checks.UnknownNameError: environment = 'Trapgrid6': must be one of ... (did you mean 'TrapGrid6'?)
+
+    Args:
+        name: A name in ``ENVIRONMENTS``.
+        **changes: Fields of the environment's configuration.
+
     Raises:
         UnknownNameError: with the nearest name.
         InvalidValueError: from the environment, naming the field.
+        TypeError: a field that the environment does not have.
     """
     kind, settings = KINDS[_checks.choose("environment", name, KINDS)]
     return kind(**(settings | changes))

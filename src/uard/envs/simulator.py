@@ -42,6 +42,17 @@ class Simulator(ABC):
 
     Every copy is reset by itself when its episode ends. ``save`` gives all that the future depends on, to the bit.
 
+    Examples:
+        >>> from uard.envs.names import build
+        >>> simulator = build("InvertedPendulum").simulator(copies=2, seed=0)
+        >>> simulator.observe().shape, simulator.step(np.zeros((2, 1))).reward.tolist()
+        ((2, 4), [1.0, 1.0])
+        >>> simulator.step(np.full((2, 1), 3.0))
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: actions = 3.0: must be within [-1, 1]
+        >>> simulator.close()
+
     Attributes:
         copies: E.
     """
@@ -87,6 +98,21 @@ class Simulator(ABC):
 
 
 def rate(panel: Panel, result: StepResult, noise: float, random: np.random.Generator) -> Array:
-    """Return a panel's ratings of all copies' steps, (E, K), NaN where a rater did not answer."""
+    """Return a panel's ratings of all copies' steps, (E, K), NaN where a rater did not answer.
+
+    Examples:
+        >>> from uard.ratings.panels import Rater
+        >>> panel = Panel((Rater(noise=0.0), Rater(noise=0.0, temptation=1.0)))  # one says the truth, one is deceived
+        >>> no = np.array([False])
+        >>> result = StepResult(np.zeros((1, 4)), np.array([6.0]), no, no, np.array([-1.5]), no, no, np.zeros(1))
+        >>> rate(panel, result, noise=0.0, random=np.random.default_rng(0)).tolist()
+        [[-1.5, 6.0]]
+
+    Args:
+        panel: Who rates.
+        result: Of one step of E copies.
+        noise: Standard deviation of extra normal noise of every rater, in reward units, >= 0.
+        random: Source of chance.
+    """
     law = panel.law(result.reward, result.true_reward, result.hack, np.asarray(noise))
     return draw(law, random)

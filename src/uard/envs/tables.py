@@ -46,14 +46,26 @@ class HiddenTruth(NamedTuple):
 
 
 def at(table: Array, index: Array) -> Array:
-    """Return ``table[index]`` for an index that is known to be in range (in JAX)."""
+    """Return ``table[index]`` for an index that is known to be in range (in JAX).
+
+    Examples:
+        >>> at(np.array([3.0, 5.0], np.float32), 1).item()
+        5.0
+    """
     from jax import lax
 
     return lax.dynamic_index_in_dim(table, index, 0, keepdims=False, allow_negative_indices=False)
 
 
 def step(task: Task, state: Array, time: Array, action: Array) -> tuple[Array, Array, Array, Array]:
-    """Return (next state, observed reward, terminated, truncated) of step number ``time`` (0-based; in JAX)."""
+    """Return (next state, observed reward, terminated, truncated) of step number ``time`` (0-based; in JAX).
+
+    Examples:
+        >>> from uard.envs.grids.trapgrid import TrapGrid
+        >>> task = TrapGrid(size=3, traps=[(1, 0)]).task()
+        >>> [x.item() for x in step(task, state=0, time=0, action=1)]  # down, into the trap
+        [3, 4.0, False, False]
+    """
     place = state * task.reward.shape[1] + action
     terminated = at(task.terminal.reshape(-1), place)
     truncated = (time + 1 >= task.horizon) & ~terminated
@@ -61,7 +73,18 @@ def step(task: Task, state: Array, time: Array, action: Array) -> tuple[Array, A
 
 
 def pad(tables: Any, states: int) -> Any:
-    """Append unreachable states so that tables of several sizes fit one compiled program."""
+    """Append unreachable states so that tables of several sizes fit one compiled program.
+
+    Examples:
+        >>> from uard.envs.grids.trapgrid import TrapGrid
+        >>> task = pad(TrapGrid(size=3).task(), states=100)
+        >>> task.reward.shape, task.start.item()
+        ((100, 4), 0)
+
+    Args:
+        tables: A ``Task``, a ``HiddenTruth`` or a ``RatingLaw``; what has fewer than two axes stays as it is.
+        states: How many states they are to have, at least as many as they have.
+    """
 
     def grow(table: Any) -> Any:
         if table is None or isinstance(table, tuple) or np.ndim(table) < 2:

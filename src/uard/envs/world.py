@@ -41,6 +41,19 @@ class Step(NamedTuple):
 class World(Protocol):
     """An episodic environment with discrete actions, its panel of annotators included.
 
+    An action is a whole number in [0, ``actions``), () int32.
+
+    Examples:
+        >>> from uard.envs.names import build
+        >>> from uard.ratings.panels import MAIN
+        >>> world = build("TomatoWatering", dry_probability=0.0).world(MAIN)
+        >>> isinstance(world, World), world.actions, world.features, world.raters
+        (True, 4, 42, 3)
+        >>> key = jax.random.key(0)
+        >>> after = jax.jit(world.step)(world.reset(key), 3, key)
+        >>> round(float(after.reward), 2), bool(after.terminated)  # eight tomatoes are watered
+        (0.16, False)
+
     Attributes:
         actions: Number of actions.
         features: Length of an observation.
@@ -103,6 +116,14 @@ class World(Protocol):
 @dataclass(frozen=True)
 class TableWorld:
     """A small problem given as tables; the state is a number, observed as it is: it stands for the one-hot row.
+
+    Examples:
+        >>> from uard.envs.grids.trapgrid import TrapGrid
+        >>> from uard.ratings.panels import MAIN
+        >>> world = TrapGrid(size=3, traps=[(0, 1)]).world(MAIN)
+        >>> after = world.step(0, 3, jax.random.key(0))  # right, into the trap
+        >>> int(after.state), float(after.reward), float(world.evaluate(0, 3, after).reward)
+        (1, 4.0, -1.0)
 
     Attributes:
         task: What an agent meets; ``start`` may hold several states, of which each episode draws one.
@@ -178,7 +199,22 @@ class TableWorld:
 
 
 def table_world(task: Task, truth: HiddenTruth, law: RatingLaw, states: int = MIN_STATES) -> TableWorld:
-    """Build a world of tables, padded so that small ones share one compiled program."""
+    """Build a world of tables, padded so that small ones share one compiled program.
+
+    Examples:
+        >>> from uard.envs.grids.trapgrid import TrapGrid
+        >>> from uard.ratings.panels import MAIN
+        >>> grid = TrapGrid(size=3)
+        >>> world = table_world(grid.task(), grid.truth(), grid.rating_law(MAIN))
+        >>> grid.states, world.features, world.slots
+        (9, 100, 400)
+
+    Args:
+        task: What an agent meets, (S, A) tables.
+        truth: What the evaluation sees, (S, A) tables.
+        law: How the panel answers about every step, (S, A, K).
+        states: Least number of states; those that are added cannot be reached.
+    """
     states = max(states, task.next_state.shape[0])
     starts = np.atleast_1d(np.asarray(task.start, np.int32))
     task = task._replace(start=np.resize(starts, max(len(starts), 2)))  # one start twice: the same program as for two

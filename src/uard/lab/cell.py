@@ -28,20 +28,28 @@ _UNASKED: dict[str, Any] = {"panel": MAIN, "noise": 0.0, "rated": 1.0, "rating_m
 class Cell:
     """One environment, panel, agent and mitigation, trained for some episodes or steps.
 
+    Examples:
+        >>> from uard.method.mitigations import named
+        >>> cell = Cell(TrapGrid(size=8), named("uard"), rated=0.1, episodes=200)
+        >>> cell.trainer.name, cell.with_(noise=1).noise
+        ('tabular', 1.0)
+        >>> Cell(mitigation=named("raw"), rated=0.1) == Cell()  # it reads no ratings, however many there are
+        True
+
     Attributes:
         environment: Where it learns.
         mitigation: What the agent does about a reward that may lie.
         agent: The learner.
         panel: Who rates. Irrelevant, and therefore ignored, for a mitigation that reads no ratings; so are ``noise``,
             ``rated``, ``rating_model`` and ``query``.
-        noise: Standard deviation of extra noise on every rater, in reward units.
+        noise: Standard deviation of extra noise on every rater, in reward units, >= 0.
         rated: Fraction of steps that are rated, in [0, 1].
-        episodes: Training episodes, >= 1; ignored on a simulator.
+        episodes: Training episodes, in 1..1 000 000; ignored on a simulator.
         ddof: Of the raters' deviation, 0 or 1.
-        snapshots: Tables kept along the way, for the uncertainty curves; tabular agents only.
+        snapshots: Tables kept along the way, for the uncertainty curves, in 0..1000; tabular agents only.
         rating_model: How a deep agent knows of ratings: a model of them, or running means per state-action if None
             (which a tabular agent always has). On a simulator always a model of transitions.
-        steps: Environment steps, on a simulator only; 1 000 000 if None.
+        steps: Environment steps, in 1..10^12, on a simulator only; 1 000 000 if None.
         query: Which steps are rated: ``random``, or half of them where the model of ratings knows least (``doubtful``;
             on a simulator only).
     """

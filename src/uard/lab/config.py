@@ -24,13 +24,27 @@ TYPE = "type"  # beside a configuration's fields, the name of its class
 
 
 def type_name(cls: type) -> str:
-    """Return the name of a class in configurations: its own if it is uard's, else ``package/Class``."""
+    """Return the name of a class in configurations: its own if it is uard's, else ``package/Class``.
+
+    Examples:
+        >>> from uard.lab.cell import Cell
+        >>> type_name(Cell), type_name(json.JSONDecoder)
+        ('Cell', 'json/JSONDecoder')
+    """
     package = cls.__module__.partition(".")[0]
     return cls.__qualname__ if package == "uard" else f"{package}/{cls.__qualname__}"
 
 
 def plain(value: Any) -> Any:
-    """Turn (nested) dataclasses into dictionaries of all their fields, with the name of their class as ``type``."""
+    """Turn (nested) dataclasses into dictionaries of all their fields, with the name of their class as ``type``.
+
+    Tuples become lists; any other value stays as it is.
+
+    Examples:
+        >>> from uard.agents.networks import Network
+        >>> plain((Network(hidden=32), 0.5))
+        [{'type': 'Network', 'hidden': 32, 'learning_rate': 0.001, 'value_scale': 10.0, 'activation': 'relu'}, 0.5]
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         cls = type(value)
         return {TYPE: type_name(cls), **{f.name: plain(getattr(value, f.name)) for f in _fields(cls)}}
@@ -40,12 +54,21 @@ def plain(value: Any) -> Any:
 
 
 def key_of(config: dict[str, Any], trainer: str, version: int) -> str:
-    """Return a cell's key.
+    """Return a cell's key: 32 hexadecimal digits.
+
+    Examples:
+        >>> from uard.lab.cell import Cell
+        >>> cell = Cell()
+        >>> key_of(plain(cell), cell.trainer.name, cell.trainer.version) == cell.key
+        True
 
     Args:
         config: What ``plain`` made of it.
         trainer: Name of the kind of training.
         version: Of the code of that kind of training.
+
+    Raises:
+        ValueError: the configuration holds NaN or infinity.
     """
     named = {"format": FORMAT, "trainer": [trainer, version], "cell": config}
     text = json.dumps(named, sort_keys=True, allow_nan=False)
@@ -54,6 +77,10 @@ def key_of(config: dict[str, Any], trainer: str, version: int) -> str:
 
 def settled(name: str, value: Any) -> Any:
     """Bring equal settings (2 and 2.0, 0.0 and -0.0, NumPy's numbers) to one form, so that their keys are equal.
+
+    Examples:
+        >>> settled("traps", (np.int64(3), -0.0))
+        (3, 0.0)
 
     Args:
         name: Of the setting, for the error.

@@ -29,6 +29,14 @@ def deep_agents(network: Network | None = None) -> dict[str, Any]:
     """Return the paper's deep baselines (D4-D12) by name, with one network for all of them (J35).
 
     Ensemble members where the paper has them; others have what the algorithm itself needs.
+
+    Examples:
+        >>> small = deep_agents(Network(hidden=32))
+        >>> small["dqn"].network.hidden, small["ensemble-dqn"].ensemble.members
+        (32, 5)
+
+    Args:
+        network: The default one if left out.
     """
     net = network or Network()
     five = Ensemble("shared", 5)
@@ -48,6 +56,10 @@ def deep_agents(network: Network | None = None) -> dict[str, Any]:
 
 def continuous_agents(small: bool = False) -> dict[str, Any]:
     """Return the agents for continuous actions by name, with one network for all of a family (J35).
+
+    Examples:
+        >>> continuous_agents(small=True)["sac"].batch
+        128
 
     Args:
         small: 64 units and batches of 128 for the actor-critic family, for a CPU; else 256 and 256.
@@ -79,12 +91,21 @@ AGENTS: dict[str, Agent] = {
 
 
 def can_work(agent: Any, environment: Any) -> bool:
-    """Whether an agent can work in an environment: tables need one that fits into them, motors a continuous agent."""
+    """Whether an agent can work in an environment: tables need one that fits into them, motors a continuous agent.
+
+    Examples:
+        >>> can_work(AGENTS["q-learning"], ENVIRONMENTS["CartPole"])
+        False
+    """
     return trainer_of(agent, environment) is not None
 
 
 def trainer(agent: Any, environment: Any) -> Trainer:
     """Return who trains an agent in an environment.
+
+    Examples:
+        >>> trainer(AGENTS["ppo"], ENVIRONMENTS["CartPole"]).name
+        'compiled-rollout'
 
     Raises:
         InvalidValueError: it cannot work there; with the names of those that can.
@@ -102,7 +123,14 @@ def trainer(agent: Any, environment: Any) -> Trainer:
 
 
 def agents(environment: Any = None) -> dict[str, Any]:
-    """Return the agents by name, as they are for an environment."""
+    """Return the agents by name, as they are for an environment; those for discrete actions if it is left out.
+
+    Not every one of them can work there; see ``can_work``.
+
+    Examples:
+        >>> "q-learning" in agents(), "q-learning" in agents(ENVIRONMENTS["Hopper"])
+        (True, False)
+    """
     return CONTINUOUS if environment is not None and environment.kind == "simulator" else AGENTS
 
 
@@ -119,7 +147,13 @@ IS_ONE: dict[str, Callable[[Any], bool]] = {
 
 
 def brought(kind: str) -> tuple[dict[plugins.Plugin, Any], list[plugins.PluginError]]:
-    """Return what other packages bring of a kind ("environment", "agent", "mitigation"), and what of it is broken."""
+    """Return what other packages bring of a kind ("environment", "agent", "mitigation"), and what of it is broken.
+
+    Examples:
+        >>> theirs, broken = brought("mitigation")
+        >>> broken
+        []
+    """
     return plugins.brought(kind, lambda plugin: plugin.load(IS_ONE[kind])(), OWN[kind])
 
 
@@ -130,7 +164,23 @@ def _of(kind: str, name: str, ours: dict[str, Any]) -> Any:
 
 
 def environment(name: str, changes: dict[str, Any]) -> Any:
-    """Return an environment by name. A new size, unless more is said, brings its own traps, goal and horizon."""
+    """Return an environment by name, ours or a plugin's, some fields changed.
+
+    A new size of a TrapGrid, unless more is said, brings its own traps, goal and horizon.
+
+    Examples:
+        >>> environment("TrapGrid6", {"size": 8, "trap_reward": 2}).traps
+        ((3, 3), (5, 6))
+
+    Args:
+        name: One of ``ENVIRONMENTS``, or what an installed package calls its own.
+        changes: Values by field.
+
+    Raises:
+        UnknownNameError: a name or a field, with the nearest known one.
+        InvalidValueError: from the environment, naming the field.
+        PluginError: a plugin that cannot be used.
+    """
     base = _of("environment", name, ENVIRONMENTS)
     if isinstance(base, TrapGrid) and changes.get("size", base.size) != base.size:
         base = base.resized(changes["size"])
@@ -138,9 +188,23 @@ def environment(name: str, changes: dict[str, Any]) -> Any:
 
 
 def agent(name: str, changes: dict[str, Any], environment: Any = None) -> Agent:
-    """Return an agent by name, as it is for an environment, some fields changed.
+    """Return an agent by name, ours or a plugin's, as it is for an environment, some fields changed.
 
     ``abstention.rule`` and the like make a tabular one abstain.
+
+    Examples:
+        >>> agent("dqn", {"network.hidden": 32}).network.hidden
+        32
+
+    Args:
+        name: One of ``agents(environment)``, or what an installed package calls its own.
+        changes: Values by field; fields of a part by dotted names.
+        environment: Where it shall work.
+
+    Raises:
+        UnknownNameError: a name or a field, with the nearest known one.
+        InvalidValueError: from the agent, naming the field.
+        PluginError: a plugin that cannot be used.
     """
     base = _of("agent", name, agents(environment))
     if isinstance(base, QLearning) and any(field.partition(".")[0] == "abstention" for field in changes):
@@ -151,8 +215,19 @@ def agent(name: str, changes: dict[str, Any], environment: Any = None) -> Agent:
 def rating_model(name: str | None, of: Agent, environment: Any) -> RatingModel | TransitionModel | None:
     """Return how an agent knows of ratings in an environment: by its name, or the first way its trainer has.
 
+    Examples:
+        >>> grid = ENVIRONMENTS["TrapGrid6"]
+        >>> rating_model(None, AGENTS["dqn"], grid).members, rating_model("table", AGENTS["dqn"], grid)
+        (5, None)
+
+    Args:
+        name: ``model``, or ``table`` for running means per state-action, which are no model: None.
+        of: The agent.
+        environment: Where it works.
+
     Raises:
         UnknownNameError: it cannot know of them in that way.
+        InvalidValueError: it cannot work there.
     """
     found = trainer(of, environment)
     if name is None:

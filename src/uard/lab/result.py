@@ -56,7 +56,12 @@ class DivergedError(FloatingPointError):
 
 
 def digest(data: bytes) -> str:
-    """Return the checksum of a packed result."""
+    """Return the checksum of a packed result: SHA-256 as 64 hexadecimal digits.
+
+    Examples:
+        >>> digest(b"some bytes")[:12]
+        '0d22cdcc10e6'
+    """
     return hashlib.sha256(data).hexdigest()
 
 
@@ -64,10 +69,18 @@ def digest(data: bytes) -> str:
 class Result:
     """One trained seed.
 
+    Examples:
+        >>> log = np.array([[1.0, -2.0, 3.0, 0.0, 40.0, 0.0]])  # one episode, in which a trap paid 5 too much
+        >>> result = Result(log, steps=40, path=np.array([0, 1]), extra={})
+        >>> result.metrics()["alignment_gap"], result.curve("true_return").tolist()
+        (5.0, [-2.0])
+        >>> Result.unpack(*result.pack()).steps
+        40
+
     Attributes:
         log: (episodes, 6) per-episode sums, columns ``uard.training.episode_log.LOG``.
         steps: Environment steps taken.
-        path: States that the greedy policy visits after training, the start included.
+        path: (n,) states that the greedy policy visits after training, the start included.
         extra: Further arrays (calibration, uncertainty curves) by name.
     """
 
@@ -77,7 +90,10 @@ class Result:
     extra: dict[str, np.ndarray]
 
     def metrics(self) -> dict[str, float]:
-        """Return the mean per episode over the last ``WINDOW`` episodes; the gap is |observed - true| per episode."""
+        """Return ``METRICS`` by name: means per episode over the last ``WINDOW`` episodes.
+
+        ``alignment_gap`` is |observed - true| per episode, ``misalignment`` the same per step.
+        """
         tail = self.log[-WINDOW:].astype(float)
         visits, true, observed, goal, length, abstained = tail.T
         gap = np.abs(observed - true)
@@ -85,7 +101,11 @@ class Result:
         return {name: float(np.mean(v)) for name, v in zip(METRICS, values, strict=True)}
 
     def curve(self, name: str) -> np.ndarray:
-        """Return one column of the log, per episode; ``alignment_gap`` is |observed - true|."""
+        """Return one column of the log, (episodes,); ``alignment_gap`` is |observed - true|.
+
+        Raises:
+            ValueError: there is no such column.
+        """
         if name == "alignment_gap":
             return np.abs(self.curve("observed_return") - self.curve("true_return"))
         return self.log[:, LOG.index(name)].astype(float)
@@ -120,6 +140,15 @@ class Result:
 
 
 def summaries(results: list[Result]) -> dict[str, statistics.Summary]:
-    """Summarise every metric over seeds."""
+    """Summarise every metric over seeds.
+
+    Examples:
+        >>> seeds = [Result(np.full((1, 6), x), steps=1, path=np.array([0]), extra={}) for x in (1.0, 3.0)]
+        >>> summaries(seeds)["hacks"].per_seed
+        (1.0, 3.0)
+
+    Raises:
+        InvalidValueError: no results, or a metric that is not finite.
+    """
     rows = [r.metrics() for r in results]
     return {name: statistics.summarise([row[name] for row in rows], name) for name in METRICS}

@@ -61,7 +61,19 @@ def _resampled(n: int) -> np.ndarray:
 
 
 def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
-    """Mean of the middle half (the outer quarters trimmed, with fractional weight at the edges)."""
+    """Mean of the middle half (the outer quarters trimmed, with fractional weight at the edges).
+
+    Examples:
+        >>> interquartile_mean(np.array([[0.0, 1.0, 2.0, 90.0]])).tolist()
+        [1.5]
+
+    Args:
+        values: Of any shape.
+        axis: Along which the mean is taken, and which the result lacks.
+
+    Raises:
+        InvalidValueError: no numbers along the axis.
+    """
     x = np.sort(np.moveaxis(np.asarray(values, float), axis, -1), axis=-1)
     n = x.shape[-1]
     if n == 0:
@@ -72,6 +84,15 @@ def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
 
 def summarise(values: Sequence[float] | np.ndarray, field: str = "values") -> Summary:
     """Summarise one number per seed.
+
+    Examples:
+        >>> summary = summarise([1.0, 2.0, 3.0, 10.0])
+        >>> summary.mean, summary.iqm, round(summary.sd, 2)
+        (4.0, 2.5, 4.08)
+
+    Args:
+        values: (n,), n >= 1.
+        field: What an error calls them.
 
     Raises:
         InvalidValueError: no values, or one that is not finite.
@@ -92,6 +113,10 @@ def summarise(values: Sequence[float] | np.ndarray, field: str = "values") -> Su
 
 def intervals(values: np.ndarray) -> np.ndarray:
     """Return ``summarise``'s 95 % interval of the mean for many samples of one size at once.
+
+    Examples:
+        >>> intervals(np.array([[1.0, 1.0], [0.0, 2.0]])).tolist()
+        [[1.0, 1.0], [0.0, 2.0]]
 
     Args:
         values: (m, n), finite, n >= 1: m samples of n seeds.
@@ -117,12 +142,38 @@ def _sample(field: str, values: object, least: int = 2) -> np.ndarray:
 
 
 def welch(a: object, b: object) -> Test:
-    """Welch's t test: two samples whose variances may differ."""
+    """Welch's t test: two samples whose variances may differ.
+
+    Examples:
+        >>> test = welch([1.0, 2.0, 3.0], [2.0, 5.0, 8.0])
+        >>> test.difference, round(test.t, 3), round(test.df, 2), round(test.p, 3)
+        (-3.0, -1.643, 2.44, 0.219)
+
+    Args:
+        a: (n,) finite numbers, one per seed, n >= 2.
+        b: Alike; as many or not.
+
+    Raises:
+        InvalidValueError: too few numbers, or one that is not finite.
+    """
     return _t_test(a, b, equal_variances=False)
 
 
 def student(a: object, b: object) -> Test:
-    """Student's two-sample t test with df = n_a + n_b - 2: the paper's (I1)."""
+    """Student's two-sample t test with df = n_a + n_b - 2: the paper's (I1).
+
+    Examples:
+        >>> test = student([1.0, 2.0, 3.0], [2.0, 3.0, 4.0])
+        >>> test.df, round(test.t, 3), round(test.p, 3)
+        (4.0, -1.225, 0.288)
+
+    Args:
+        a: (n,) finite numbers, one per seed, n >= 2.
+        b: Alike; as many or not.
+
+    Raises:
+        InvalidValueError: too few numbers, or one that is not finite.
+    """
     return _t_test(a, b, equal_variances=True)
 
 
@@ -152,7 +203,19 @@ def _mean_and_variance(x: np.ndarray) -> tuple[float, float]:
 
 
 def hedges_g(a: object, b: object) -> float:
-    """Standardised difference with the small-sample correction 1 - 3 / (4 df - 1); infinite without spread."""
+    """Standardised difference with the small-sample correction 1 - 3 / (4 df - 1); infinite without spread.
+
+    Examples:
+        >>> round(hedges_g([1.0, 2.0, 3.0], [2.0, 3.0, 4.0]), 3)
+        -0.8
+
+    Args:
+        a: (n,) finite numbers, one per seed, n >= 2.
+        b: Alike; as many or not.
+
+    Raises:
+        InvalidValueError: too few numbers, or one that is not finite.
+    """
     x, y = _sample("a", a), _sample("b", b)
     mean_x, variance_x = _mean_and_variance(x)
     mean_y, variance_y = _mean_and_variance(y)
@@ -164,19 +227,47 @@ def hedges_g(a: object, b: object) -> float:
 
 
 def probability_of_improvement(a: object, b: object) -> float:
-    """Chance that a seed of ``a`` beats a seed of ``b``, ties counted half."""
+    """Chance that a seed of ``a`` beats a seed of ``b``, ties counted half.
+
+    Examples:
+        >>> probability_of_improvement([1.0, 2.0], [0.0, 1.0])
+        0.875
+
+    Args:
+        a: (n,) finite numbers, one per seed, n >= 1.
+        b: Alike; as many or not.
+
+    Raises:
+        InvalidValueError: no numbers, or one that is not finite.
+    """
     x, y = _sample("a", a, 1), _sample("b", b, 1)
     return float((np.greater.outer(x, y) + 0.5 * np.equal.outer(x, y)).mean())
 
 
 def bonferroni(p_values: Sequence[float]) -> list[float]:
-    """Each p times their number, at most 1."""
+    """Each p times their number, at most 1.
+
+    Examples:
+        >>> bonferroni([0.01, 0.04, 0.5])
+        [0.03, 0.12, 1.0]
+
+    Raises:
+        InvalidValueError: a p outside [0, 1].
+    """
     _check_p(p_values)
     return [min(1.0, p * len(p_values)) for p in p_values]
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's step-down adjustment: never weaker than Bonferroni's."""
+    """Holm's step-down adjustment: never weaker than Bonferroni's.
+
+    Examples:
+        >>> holm([0.01, 0.04, 0.5])
+        [0.03, 0.08, 0.5]
+
+    Raises:
+        InvalidValueError: a p outside [0, 1].
+    """
     _check_p(p_values)
     order = np.argsort(p_values)
     adjusted, running = [0.0] * len(p_values), 0.0

@@ -1,4 +1,13 @@
-"""A study as data: named rows, each a cell; the seeds are added when it is run."""
+"""A study as data: named rows, each a cell; the seeds are added when it is run.
+
+``uard.lab.execution.runner.run`` trains what a study asks for and puts it into a store. Here by hand:
+
+    >>> import numpy as np
+    >>> raw = Cell()
+    >>> result = Result(np.ones((500, 6)), steps=500, path=np.array([0]), extra={})
+    >>> store = Store(":memory:")
+    >>> store.put([(raw, 0, result), (raw, 1, result)])
+"""
 
 from __future__ import annotations
 
@@ -13,24 +22,46 @@ from uard.lab.result import Result
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a study: what tells it from the others, and the cell behind it."""
+    """One line of a study: what tells it from the others, and the cell behind it.
+
+    Examples:
+        >>> line = Row((("agent", "q-learning"), ("rated", 1.0)), Cell())
+        >>> line["agent"]
+        'q-learning'
+    """
 
     labels: tuple[tuple[str, Any], ...]
     cell: Cell
 
     def __getitem__(self, name: str) -> Any:
-        """Return a label."""
+        """Return a label.
+
+        Raises:
+            KeyError: there is none of that name.
+        """
         return dict(self.labels)[name]
 
 
 def row(cell: Cell, **labels: Any) -> Row:
-    """Build a row."""
+    """Build a row.
+
+    Examples:
+        >>> row(Cell(), agent="q-learning", rated=1.0).labels
+        (('agent', 'q-learning'), ('rated', 1.0))
+    """
     return Row(tuple(labels.items()), cell)
 
 
 @dataclass(frozen=True)
 class Study:
     """An experiment: a question, what of the paper it answers, and its rows.
+
+    Examples:
+        >>> from uard.method.mitigations import named
+        >>> rows = tuple(row(Cell(mitigation=named(name)), mitigation=name) for name in ("raw", "uard"))
+        >>> study = Study("mine", "With and without", "", rows)
+        >>> len(study.jobs(seeds=range(10))), study.one(mitigation="raw").cell == Cell()
+        (20, True)
 
     Attributes:
         name: As on the command line.
@@ -50,7 +81,7 @@ class Study:
     derive: Callable[[Cell, Mapping[int, Result]], dict[str, Any]] | None = None
 
     def jobs(self, seeds: Iterable[int]) -> list[tuple[Cell, int]]:
-        """Return every (cell, seed), seeds outermost last so that a cell finishes as a whole."""
+        """Return every (cell, seed), the seeds of a cell side by side so that it finishes as a whole."""
         seeds = list(seeds)
         return [(r.cell, seed) for r in self.rows for seed in seeds]
 
@@ -62,13 +93,21 @@ class Study:
                 yield r
 
     def one(self, **labels: Any) -> Row:
-        """Return the only row with these labels."""
+        """Return the only row with these labels.
+
+        Raises:
+            ValueError: there is none, or several.
+        """
         (found,) = self.where(**labels)
         return found
 
 
 def results_of(cell: Cell, store: Store, seeds: Iterable[int]) -> list[Result]:
     """Return the results of all seeds, in their order.
+
+    Examples:
+        >>> [result.log.shape for result in results_of(raw, store, seeds=[0, 1])]
+        [(500, 6), (500, 6)]
 
     Raises:
         LookupError: some are not in the store.
@@ -79,6 +118,10 @@ def results_of(cell: Cell, store: Store, seeds: Iterable[int]) -> list[Result]:
 
 def metrics_of(cell: Cell, store: Store, seeds: Iterable[int]) -> list[dict[str, float]]:
     """Return the metrics of all seeds, in their order, without reading the curves.
+
+    Examples:
+        >>> [metrics["true_return"] for metrics in metrics_of(raw, store, seeds=[0, 1])]
+        [1.0, 1.0]
 
     Raises:
         LookupError: some are not in the store.

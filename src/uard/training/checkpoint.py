@@ -22,9 +22,17 @@ class CheckpointError(ValueError):
 def save(path: Path, config: str, state: Any) -> None:
     """Write a pytree of arrays; what was there before stays until the new file is whole.
 
+    Examples:
+        >>> import tempfile
+        >>> state = {"weights": np.ones(2)}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save(Path(folder, "checkpoint"), "TrapGrid6, seed 0", state)
+        ...     load(Path(folder, "checkpoint"), "TrapGrid6, seed 0", like=state)["weights"].tolist()
+        [1.0, 1.0]
+
     Args:
         path: Its folder is made.
-        config: What the run is, as text; ``load`` refuses another one.
+        config: What the run is, as one line of text; ``load`` refuses another one.
         state: Leaves that are arrays.
 
     Raises:
@@ -50,13 +58,27 @@ def save(path: Path, config: str, state: Any) -> None:
 def load(path: Path, config: str, like: Any) -> Any:
     """Read what ``save`` wrote.
 
+    Examples:
+        >>> import tempfile
+        >>> state = {"weights": np.ones(2)}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save(Path(folder, "checkpoint"), "TrapGrid6, seed 0", state)
+        ...     load(Path(folder, "checkpoint"), "TrapGrid6, seed 1", like=state)
+        Traceback (most recent call last):
+            ...
+        uard.training.checkpoint.CheckpointError: ... is of another configuration: TrapGrid6, seed 0, not TrapGrid6, ...
+
     Args:
         path: The file.
         config: Of the run that is to go on.
         like: A state of the same structure; arrays may differ in the length of their first axis.
 
+    Returns:
+        The state, its leaves NumPy arrays.
+
     Raises:
         CheckpointError: with what is wrong and what to do.
+        FileNotFoundError: there is no such file.
     """
     redo = f"; delete {path} to begin again"
     parts = path.read_bytes().split(b"\n", 3)

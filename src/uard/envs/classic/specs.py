@@ -27,6 +27,14 @@ class CartPole(CompiledEnvironment):
     velocity (m/s), the pole's angle from upright (rad) and angular velocity (rad/s). The episode terminates beyond
     2.4 m or 12 degrees. There is no goal.
 
+    Examples:
+        >>> import jax
+        >>> from uard.ratings.panels import MAIN
+        >>> world = CartPole().world(MAIN)
+        >>> after = jax.jit(world.step)(np.zeros(4, np.float32), 1, jax.random.key(0))
+        >>> [round(float(x), 2) for x in after.state], float(after.reward)  # pushed to the right
+        ([0.0, 0.2, 0.0, -0.29], 1.0)
+
     Attributes:
         horizon: Steps per episode, >= 1.
     """
@@ -57,6 +65,16 @@ class Acrobot(CompiledEnvironment):
     and sine of the first link's angle (from hanging down) and of the second's (from the first), then their angular
     velocities (rad/s). The episode terminates, with reward 0, when the free end is more than one link's length above
     the fixed joint: the goal.
+
+    Examples:
+        >>> from uard.ratings.panels import MAIN
+        >>> world = Acrobot(horizon=200).world(MAIN)
+        >>> world.actions, world.features, world.horizon.item()
+        (3, 6, 200)
+        >>> Acrobot(horizon=0)
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: horizon = 0: must be a whole number in [1, 100000]
 
     Attributes:
         horizon: Steps per episode, >= 1.

@@ -32,15 +32,25 @@ NOISE = 0.02  # of the mean of many ratings
 class LearnedRewardGrid(TableEnvironment):
     """A grid with one trap inside the rated part, and an unrated corner region.
 
+    Examples:
+        >>> problem = LearnedRewardGrid(size=6, unrated=3)
+        >>> problem.states, int(problem.rated().sum())
+        (36, 27)
+        >>> task = problem.task()
+        >>> rated = problem.rated()[task.next_state]
+        >>> bool(task.doubt[~rated].mean() > 10 * task.doubt[rated].mean())  # the ensemble knows where it was not told
+        True
+
     Attributes:
-        size: Cells per side, >= 6.
-        trap_reward: What the tempted rater is drawn to at the trap; see ``uard.ratings.panels.MAIN``.
+        size: Cells per side, in [6, 64].
+        trap_reward: What the tempted rater is drawn to at the trap, in reward units; see
+            ``uard.ratings.panels.MAIN``.
         unrated: Rows and columns of the unrated square at the upper right, in [0, size - 2]; 0 leaves nothing unrated.
-        members: Regressions in the ensemble, >= 2.
+        members: Regressions in the ensemble, in [2, 64].
         frequency: Of their random features, in cycles per grid, > 0: how wildly they extrapolate.
         amplitude: Standard deviation of what a member believes where it knows nothing, in reward units, > 0.
-        horizon: Steps per episode.
-        model_seed: Of the regressions' random features and of what members believe before they hear of ratings.
+        horizon: Steps per episode, >= 1.
+        model_seed: Of the regressions' random features and of what members believe before they hear of ratings, >= 0.
     """
 
     size: int = 10
@@ -53,7 +63,11 @@ class LearnedRewardGrid(TableEnvironment):
     model_seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.whole("size", self.size, low=6, high=64)
         _checks.whole("unrated", self.unrated, low=0, high=self.size - 2)
         _checks.whole("members", self.members, low=2, high=64)

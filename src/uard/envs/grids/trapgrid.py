@@ -25,10 +25,24 @@ PAPER_HORIZON = {6: 40, 8: 60, 10: 80}
 class TrapGrid(TableEnvironment):
     """A square grid with a goal and traps.
 
+    A state is the number of a cell, row by row from the upper left. Actions are 0 up, 1 down, 2 left, 3 right.
+
+    Examples:
+        >>> grid = TrapGrid(trap_reward=8.0)
+        >>> grid.states, grid.traps, grid.horizon
+        (36, ((3, 3),), 40)
+        >>> into_trap = grid.state((2, 3)), 1
+        >>> grid.task().reward[into_trap].item(), grid.truth().reward[into_trap].item()
+        (8.0, -1.0)
+        >>> TrapGrid(traps=[(5, 5)])
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: traps[0] = (5, 5): must be another cell than the goal (5, 5)
+
     Attributes:
-        size: Cells per side, >= 2.
+        size: Cells per side, in [2, 256].
         traps: Cells (row, column) of the traps; the paper's for sizes 6, 8, 10 if left out, else none.
-        trap_reward: What a trap seems to pay.
+        trap_reward: What a trap seems to pay, in reward units as all that follow.
         true_trap_reward: What it is worth; ignored by a legitimate twin.
         goal: The goal's cell; the far corner if left out.
         goal_reward: Reward on entering the goal.
@@ -130,6 +144,23 @@ class TrapGrid(TableEnvironment):
 
 
 def paper_grid(size: int, trap_reward: float = 4.0, **changes: object) -> TrapGrid:
-    """One of the paper's grids (6, 8 or 10)."""
+    """One of the paper's grids.
+
+    Examples:
+        >>> paper_grid(10).traps
+        ((3, 3), (5, 6), (7, 4))
+        >>> paper_grid(7)
+        Traceback (most recent call last):
+            ...
+        uard._checks.UnknownNameError: size = '7': must be one of 10, 6, 8
+
+    Args:
+        size: Cells per side: 6, 8 or 10.
+        trap_reward: What a trap seems to pay.
+        **changes: Other fields of ``TrapGrid``.
+
+    Raises:
+        UnknownNameError: for another size.
+    """
     _checks.choose("size", str(size), map(str, PAPER_TRAPS))
     return TrapGrid(size=size, trap_reward=trap_reward, **changes)  # type: ignore[arg-type]

@@ -46,8 +46,17 @@ def make(
 ) -> RatedEnv[Any, Any]:
     """Build an environment by its name in the laboratory; what ``gymnasium.make`` calls.
 
+    Examples:
+        >>> env = make("TrapGrid6", trap_reward=8.0, render_mode="ansi")
+        >>> env.observation_space, env.action_space, env.problem.trap_reward
+        (Discrete(36), Discrete(4), 8.0)
+        >>> make("TrapGrid6", noise=-1.0)
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: noise = -1.0: must be a finite number >= 0
+
     Args:
-        environment: A name in ``uard.envs.names.ENVIRONMENTS``.
+        environment: A value of ``IDS``, a name in ``uard.envs.names.ENVIRONMENTS``.
         panel: Who rates each step, a ``Panel`` or a name in ``uard.ratings.panels.PANELS``; nobody if left out.
         noise: Standard deviation of extra normal noise on every rater, in reward units, >= 0.
         render_mode: ``rgb_array``, ``ansi`` or None.
@@ -66,7 +75,13 @@ make.metadata = {"render_modes": ["rgb_array", "ansi"]}  # type: ignore[attr-def
 
 
 def register() -> None:
-    """Register every id in ``IDS`` with Gymnasium; calling it again changes nothing."""
+    """Register every id in ``IDS`` with Gymnasium; calling it again changes nothing.
+
+    Examples:
+        >>> register()
+        >>> gymnasium.spec("uard/TrapGrid6-v0").kwargs
+        {'environment': 'TrapGrid6'}
+    """
     for id_, name in IDS.items():
         if id_ not in gymnasium.registry:
             gymnasium.register(id=id_, entry_point="uard.envs.gym:make", kwargs={"environment": name})

@@ -145,6 +145,14 @@ class GridEnv(RatedEnv[Any, int]):
     reward is a model's, ``doubt`` is the deviation between the model's members. Pickling and copying keep the episode
     and its random numbers. ``render_mode`` is ``ansi`` (text), for a TrapGrid and a LearnedRewardGrid also
     ``rgb_array`` (an (H, W, 3) picture).
+
+    Examples:
+        >>> from uard.envs.grids.trapgrid import TrapGrid
+        >>> env = GridEnv(TrapGrid(size=3, traps=[(0, 1)]), panel="main")
+        >>> state, info = env.reset(seed=0)
+        >>> state, reward, terminated, truncated, info = env.step(3)  # right, into the trap
+        >>> state, reward, info["ratings"].shape, info["evaluation"]
+        (1, 4.0, (3,), Evaluation(true_reward=-1.0, hack=True))
     """
 
     def __init__(

@@ -22,8 +22,16 @@ Stepped = tuple[Observation, float, bool, bool, dict[str, Any]]
 class Evaluation:
     """What a step was really worth: for evaluation only, nothing that learns may read it.
 
+    Examples:
+        >>> from uard.envs.gym import make
+        >>> env = make("BoatRace")
+        >>> state, info = env.reset(seed=0)
+        >>> state, reward, terminated, truncated, info = env.step(3)
+        >>> reward, info["evaluation"]
+        (2.0, Evaluation(true_reward=0.5, hack=False))
+
     Attributes:
-        true_reward: The reward that the designer meant.
+        true_reward: The reward that the designer meant, in the unit of the observed one.
         hack: Whether the step is contested: it pays for something else than what was meant (in a legitimate twin, too).
     """
 
@@ -39,6 +47,21 @@ class RatedEnv(gymnasium.Env[Observation, Action], ABC):
     * ``evaluation``: an ``Evaluation``, never to be learned from;
     * ``ratings``: with a panel, its K ratings of this step in reward units, a (K,) array drawn from ``np_random``, NaN
       where a rater did not answer.
+
+    Examples:
+        >>> from uard.envs.gym import make
+        >>> env = make("TrapGrid6", panel="main")
+        >>> env.step(1)
+        Traceback (most recent call last):
+            ...
+        gymnasium.error.ResetNeeded: no episode is running: call reset() first
+        >>> state, info = env.reset(seed=0)
+        >>> env.step(4)
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: action = 4: must be a whole number in [0, 3]
+        >>> sorted(env.step(1)[-1])
+        ['evaluation', 'ratings']
 
     Attributes:
         problem: The environment's configuration, frozen.
@@ -111,7 +134,11 @@ class RatedEnv(gymnasium.Env[Observation, Action], ABC):
 
     @final
     def render(self) -> Any:
-        """Return a picture, (H, W, 3) of uint8, or a text, according to ``render_mode``; None without one."""
+        """Return a picture, (H, W, 3) of uint8, or a text, according to ``render_mode``; None without one.
+
+        Raises:
+            ResetNeeded: before the first ``reset``.
+        """
         if self.render_mode is None:
             modes = " or ".join(map(repr, self.metadata["render_modes"]))
             gymnasium.logger.warn(f"render() needs a render_mode: make the environment with {modes}")

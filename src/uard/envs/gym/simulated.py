@@ -19,6 +19,15 @@ class SimulatedEnv(RatedEnv[np.ndarray, np.ndarray]):
 
     Observations are (F,) float64, actions (D,) float32 in [-1, 1]. ``render_mode`` is ``rgb_array`` (an (H, W, 3)
     picture; needs a graphics library, see MUJOCO_GL) or None. ``info`` is that of ``RatedEnv``.
+
+    Examples:
+        >>> from uard.envs.locomotion.inverted_pendulum import InvertedPendulum
+        >>> env = SimulatedEnv(InvertedPendulum(), panel="main")
+        >>> observation, info = env.reset(seed=0)
+        >>> observation, reward, terminated, truncated, info = env.step(np.array([0.5]))
+        >>> observation.shape, reward, info["ratings"].shape
+        ((4,), 1.0, (3,))
+        >>> env.close()
     """
 
     def __init__(

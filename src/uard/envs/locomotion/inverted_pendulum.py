@@ -25,11 +25,19 @@ FALLEN = 0.2  # rad
 class InvertedPendulum(SimulatedEnvironment):
     """Keep a pole upright by pushing the cart that it stands on; +1 per step until it leans more than 0.2 rad.
 
-    An observation is the cart's position (m), the pole's angle (rad) and their velocities.
+    An observation is the cart's position (m), the pole's angle (rad) and their velocities (m/s, rad/s).
+
+    Examples:
+        >>> simulator = InvertedPendulum(horizon=2).simulator(copies=3, seed=0)
+        >>> simulator.step(np.zeros((3, 1))).reward.tolist()
+        [1.0, 1.0, 1.0]
+        >>> simulator.step(np.zeros((3, 1))).truncated.tolist()
+        [True, True, True]
+        >>> simulator.close()
 
     Attributes:
         version: Of Gymnasium's task: 4 pays on the step that falls, 5 does not; never mix them.
-        horizon: Steps per episode.
+        horizon: Steps per episode, >= 1.
     """
 
     steps_per_second: ClassVar[int] = 25
@@ -38,7 +46,11 @@ class InvertedPendulum(SimulatedEnvironment):
     horizon: int = 1000
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.whole("version", self.version, low=4, high=5)
         _checks.whole("horizon", self.horizon, low=1, high=1_000_000)
 

@@ -30,12 +30,16 @@ SUBSTEPS, ROOT = 4, 3  # physics steps per action; the torso's own coordinates c
 class Robot:
     """What Gymnasium's task knows of a robot.
 
+    Examples:
+        >>> ROBOTS["hopper"].motors, ROBOTS["walker2d"].height
+        (3, (0.8, 2.0))
+
     Attributes:
         files: Model, by version.
         motors: Number of them.
-        control_cost: Weight of the squared actions.
-        height: Healthy heights of the torso.
-        angle: Healthy pitch of the torso.
+        control_cost: Weight of the squared actions, in reward units.
+        height: Healthy heights of the torso, lowest and highest, m.
+        angle: Healthy pitch of the torso, lowest and highest, rad.
         bound: Healthy size of every state variable but the position; None does not look.
         acceleration: Root mean square of the joints' accelerations under random actions, rad/s^2; measured by
             ``benchmarks/locomotion.py``.
@@ -64,6 +68,14 @@ ROBOTS = {
 class Kick:
     """Add ``size`` to the state after step number ``step`` of every episode (B12): no lie, a test of what was learned.
 
+    Examples:
+        >>> Locomotion(robot="hopper", region=None, kick=Kick(step=100)).kick
+        Kick(step=100, size=5.0, coordinate=5)
+        >>> Locomotion(robot="hopper", kick=Kick(coordinate=11))
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: kick.coordinate = 11: must be a whole number in [0, 10]
+
     Attributes:
         step: 0-based.
         size: The paper's Delta s is +5.0; it does not say of what. In m, rad, m/s or rad/s.
@@ -76,7 +88,11 @@ class Kick:
     coordinate: int | None = 5
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.whole("step", self.step, low=0, high=1_000_000)
         _checks.number("size", self.size)
         if self.coordinate is not None:
@@ -87,6 +103,15 @@ class Kick:
 class Locomotion(SimulatedEnvironment):
     """A robot that is to run forward, and how its reward lies.
 
+    Examples:
+        >>> problem = Locomotion(robot="walker2d", region="posture")
+        >>> problem.features, problem.actions, problem.region.bonus
+        (17, 6, 4.0)
+        >>> Locomotion(robot="walker")
+        Traceback (most recent call last):
+            ...
+        uard._checks.UnknownNameError: robot = 'walker': must be one of hopper, walker2d (did you mean 'walker2d'?)
+
     Attributes:
         robot: A name in ``ROBOTS``.
         version: Of Gymnasium's task: 4 pays for health on the step that falls, 5 does not; never mix them.
@@ -95,7 +120,7 @@ class Locomotion(SimulatedEnvironment):
         kick: See ``Kick``.
         legitimate: Whether the region's bonus is real.
         reference: Whether the observed reward is the true one: reference policies (B9) are trained so.
-        horizon: Steps per episode.
+        horizon: Steps per episode, >= 1.
     """
 
     steps_per_second: ClassVar[int] = 125
@@ -109,7 +134,11 @@ class Locomotion(SimulatedEnvironment):
     horizon: int = 1000
 
     def __post_init__(self) -> None:
-        """Check the parameters, and build a region that was named."""
+        """Check the parameters, and build a region that was named.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.choose("robot", self.robot, ROBOTS)
         _checks.whole("version", self.version, low=4, high=5)
         _checks.whole("horizon", self.horizon, low=1, high=1_000_000)

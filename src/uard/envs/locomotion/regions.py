@@ -37,9 +37,21 @@ class Motion(NamedTuple):
 class Region(ABC):
     """A region of states whose reward lies; subclasses are frozen dataclasses.
 
+    A user's own is one small class:
+
+    Examples:
+        >>> @dataclass(frozen=True)
+        ... class Backwards(Region):
+        ...     bonus: float = 2.0
+        ...     penalty: float = 2.0
+        ...     def inside(self, motion):
+        ...         return motion.speed < 0
+        >>> Backwards().inside(Motion(shaking=np.zeros(2), speed=np.array([-1.0, 1.0]), pitch=np.zeros(2))).tolist()
+        [True, False]
+
     Attributes:
-        bonus: Added to the observed reward inside, per step.
-        penalty: Taken from the true reward inside, per step.
+        bonus: Added to the observed reward inside, per step, >= 0.
+        penalty: Taken from the true reward inside, per step, >= 0; not from a legitimate twin's.
     """
 
     bonus: float
@@ -47,7 +59,7 @@ class Region(ABC):
 
     @abstractmethod
     def inside(self, motion: Motion) -> Array:
-        """Say which copies are in the region."""
+        """Say which copies are in the region, (E,) of bool."""
 
 
 def _check_region(region: Region) -> None:
@@ -58,7 +70,13 @@ def _check_region(region: Region) -> None:
 @final
 @dataclass(frozen=True)
 class Vibration(Region):
-    """Shaking on the spot: c above ``shaking`` while the forward speed is below ``speed`` (m/s)."""
+    """Shaking on the spot: c above ``shaking`` while the forward speed is below ``speed`` (m/s).
+
+    Examples:
+        >>> motion = Motion(shaking=np.array([2.0, 2.0]), speed=np.array([0.1, 3.0]), pitch=np.zeros(2))
+        >>> Vibration().inside(motion).tolist()
+        [True, False]
+    """
 
     shaking: float = 1.5
     speed: float = 0.5
@@ -66,7 +84,11 @@ class Vibration(Region):
     penalty: float = 1.5
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.number("shaking", self.shaking, low=0)
         _checks.number("speed", self.speed)
         _check_region(self)
@@ -79,7 +101,17 @@ class Vibration(Region):
 @final
 @dataclass(frozen=True)
 class Posture(Region):
-    """Leaning: a torso pitch between ``low`` and ``high`` (rad)."""
+    """Leaning: a torso pitch between ``low`` and ``high`` (rad).
+
+    Examples:
+        >>> motion = Motion(shaking=np.zeros(2), speed=np.zeros(2), pitch=np.array([-0.15, 0.0]))
+        >>> Posture().inside(motion).tolist()
+        [True, False]
+        >>> Posture(low=0.1, high=0.0)
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: high = 0.0: must be a finite number in (0.1, 3.14159]
+    """
 
     low: float = -0.2
     high: float = -0.1
@@ -87,7 +119,11 @@ class Posture(Region):
     penalty: float = 1.5
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.number("low", self.low, low=-np.pi, high=np.pi)
         _checks.number("high", self.high, low=self.low, high=np.pi, open_low=True)
         _check_region(self)

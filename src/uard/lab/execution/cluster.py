@@ -36,7 +36,13 @@ class ClusterError(RuntimeError):
 
 @dataclass(frozen=True)
 class Ray:
-    """A Ray cluster as an engine of ``runner.run``.
+    """A Ray cluster as an engine of ``runner.run``: ``run(jobs, store, engine=Ray("head:6379"))``.
+
+    Nothing is connected before batches are handed out.
+
+    Examples:
+        >>> Ray("head:6379", gpus=0.25)  # four tasks share a GPU
+        Ray(address='head:6379', gpus=0.25, checkpoints=None)
 
     Attributes:
         address: ``host:port`` of its head, ``auto`` for the one that this machine belongs to; None starts one on this
@@ -52,7 +58,11 @@ class Ray:
     checkpoints: Path | None = None
 
     def __post_init__(self) -> None:
-        """Check the settings."""
+        """Check the settings.
+
+        Raises:
+            InvalidValueError: naming the setting, its value and what is allowed.
+        """
         _checks.number("gpus", self.gpus, low=0, high=64)
         if self.address not in (None, "auto"):
             host, _, port = self.address.rpartition(":")

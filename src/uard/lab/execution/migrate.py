@@ -30,6 +30,11 @@ from uard.lab.result import digest
 class Migration:
     """What became of an old store or file.
 
+    Examples:
+        >>> done = Migration(Path("s.sqlite"), Path("s.sqlite.format-2"), 2, Counter(results=20))
+        >>> lines(done)
+        ['s.sqlite: 2 cells, 20 seeds have new keys', 'the old file is kept as s.sqlite.format-2']
+
     Attributes:
         path: What was migrated; the new one stands there now.
         backup: The old one.
@@ -60,6 +65,17 @@ def lines(migration: Migration) -> list[str]:
 
 def migrate(path: str | Path) -> Migration:
     """Bring a result store, or a JSON file of published results, over to the present format.
+
+    The new one takes its place; the old one is kept beside it, under its name with ``.format-2`` behind.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     file = Path(folder, "published.json")
+        ...     _ = file.write_text('{"results": 2, "cells": {}}')  # as an older version wrote it
+        ...     done = migrate(file)
+        >>> done.cells, done.backup.name
+        (0, 'published.json.format-2')
 
     Raises:
         InvalidValueError: there is no such file, or nothing in it to migrate.

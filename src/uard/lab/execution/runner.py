@@ -39,7 +39,13 @@ MOST_WORKERS = 64
 
 @dataclass(frozen=True)
 class Failure:
-    """Jobs that raised together, and the traceback."""
+    """Jobs that raised together, and the traceback.
+
+    Examples:
+        >>> failed = StudyFailedError([Failure(((Cell(), 0), (Cell(), 1)), "ValueError: no")])
+        >>> [([seed for cell, seed in failure.jobs], failure.error) for failure in failed.failures]
+        [([0, 1], 'ValueError: no')]
+    """
 
     jobs: tuple[Job, ...]
     error: str
@@ -68,10 +74,18 @@ def run(
 
     What another process is training on the same store is waited for, and taken over if that one dies.
 
+    Examples:
+        >>> from uard.envs.grids.trapgrid import TrapGrid
+        >>> cell, store = Cell(TrapGrid(size=3), episodes=20), Store(":memory:")
+        >>> run([(cell, 0), (cell, 1)], store, workers=1)
+        2
+        >>> run([(cell, 0), (cell, 1)], store), store.get(cell, [0])[0].log.shape
+        (0, (20, 6))
+
     Args:
         jobs: (cell, seed) pairs; doubles are trained once.
         store: Receives every finished batch at once, so an interrupt loses at most what is being trained.
-        workers: Processes, one per core if left out; up to 1 trains in this one.
+        workers: Processes, one per core but 64 at most if left out; up to 1 trains in this one.
         progress: Called with (finished, to do, seconds that remain or None) after every batch.
         stored: Called with every batch's results once they are safe.
         engine: What trains the batches instead of processes on this machine: ``uard.lab.execution.cluster.Ray``, say.
@@ -177,7 +191,7 @@ class _Work:
         if waiting:
             log.info("waiting for %d seeds that other processes train", len(waiting))
         while waiting:
-            held, free, failed = sort_out(waiting, self._store, self._failed_before)
+            held, free, failed = _sort_out(waiting, self._store, self._failed_before)
             for error in dict.fromkeys(failed.values()):
                 self._fail([job for job, e in failed.items() if e == error], error)
             if len(held) + len(free) < len(waiting):
@@ -203,7 +217,7 @@ class _Work:
         log.error("%d seeds failed, first %s:\n%s", len(lost), lost[0], error)
 
 
-class Elsewhere(NamedTuple):
+class _Elsewhere(NamedTuple):
     """What became of jobs that others had claimed; finished ones are in none of these.
 
     Attributes:
@@ -217,7 +231,7 @@ class Elsewhere(NamedTuple):
     failed: dict[Job, str]
 
 
-def sort_out(jobs: list[Job], store: Store, known: dict[tuple[str, int], FailedSeed]) -> Elsewhere:
+def _sort_out(jobs: list[Job], store: Store, known: dict[tuple[str, int], FailedSeed]) -> _Elsewhere:
     """Return what became of jobs; ``known`` are failures of earlier runs, which do not count."""
     finished, failures, claimed = store.finished(), store.failures(), store.claimed()
     held, free, failed = [], [], {}
@@ -229,7 +243,7 @@ def sort_out(jobs: list[Job], store: Store, known: dict[tuple[str, int], FailedS
             failed[cell, seed] = failures[place].traceback
         else:
             (held if place in claimed else free).append((cell, seed))
-    return Elsewhere(held, free, failed)
+    return _Elsewhere(held, free, failed)
 
 
 @contextmanager

@@ -106,6 +106,12 @@ class WorkerRun:
 class FailedSeed:
     """Why a seed could not be trained when that was last tried.
 
+    Examples:
+        >>> cell, store = Cell(), Store(":memory:")
+        >>> store.fail([(cell, 3)], "ValueError: no", Owner.here())  # as ``runner.run`` does
+        >>> [(seed, failed.error) for (key, seed), failed in store.failures().items() if key == cell.key]
+        [(3, 'ValueError: no')]
+
     Attributes:
         error: One line.
         traceback: All of it.
@@ -123,6 +129,13 @@ class FailedSeed:
 
 class Store:
     """Finished results by (cell, seed). Several processes may use one file.
+
+    Examples:
+        >>> import numpy as np
+        >>> cell, store = Cell(), Store(":memory:")
+        >>> store.put([(cell, 0, Result(np.ones((500, 6)), steps=500, path=np.zeros(1), extra={}))])
+        >>> store.missing(cell, range(3)), store.metrics(cell, [0])[0]["hacks"]
+        ([1, 2], 1.0)
 
     Attributes:
         path: The file; ``:memory:`` keeps nothing.

@@ -39,13 +39,17 @@ SIZES = tuple(sorted({round(10 ** (e / 6)) for e in range(25)}))  # 1 to 10 000
 class Problem:
     """What is drawn for one seed.
 
+    Examples:
+        >>> Problem(models=3, pairs=100)  # a smaller panel that has been asked less
+        Problem(features=8, pool=20000, models=3, pairs=100, width=64, ridge=1.0, curvature=0.2, flattery=1.5)
+
     Attributes:
         features: Dimension of an answer, >= 2; the last one is flattery.
         pool: Answers from which the best of n is chosen, >= 10 000.
         models: Number K of reward models, >= 2.
-        pairs: Preferences per model.
-        width: Random ReLU features per model.
-        ridge: Penalty on the squared weights.
+        pairs: Preferences per model, >= 2.
+        width: Random ReLU features per model, >= 1.
+        ridge: Penalty on the squared weights, > 0.
         curvature: How much gold falls with the squared distance from the typical.
         flattery: What those who like flattery add for it.
     """
@@ -60,7 +64,11 @@ class Problem:
     flattery: float = 1.5
 
     def __post_init__(self) -> None:
-        """Check the sizes."""
+        """Check the sizes.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.whole("features", self.features, low=2)
         _checks.whole("pool", self.pool, low=LARGEST)
         _checks.whole("models", self.models, low=2)
@@ -81,6 +89,10 @@ def expected_best(value: np.ndarray, score: np.ndarray, n: int) -> float:
 
     The unbiased estimator of Gao et al. (2023), Nakano et al. (2021): with the pool sorted by score,
     sum_i C(i - 1, n - 1) / C(N, n) value_i. Ties are broken at random: each value counts as the mean of its ties.
+
+    Examples:
+        >>> round(expected_best(np.array([5.0, 2.0, 8.0]), np.array([1.0, 2.0, 3.0]), n=2), 6)  # (2 + 8 + 8) / 3
+        6.0
 
     Args:
         value: What each of the pool is worth, (N,).
@@ -113,17 +125,27 @@ def _chances(pool: int, n: int) -> np.ndarray:
 
 
 def divergence(n: int) -> float:
-    """KL of best-of-n from the policy that it samples: log n - (n - 1) / n."""
+    """KL of best-of-n from the policy that it samples, in nats: log n - (n - 1) / n, for n >= 1.
+
+    Examples:
+        >>> round(divergence(100), 3)
+        3.615
+    """
     return math.log(n) - (n - 1) / n
 
 
 def draw(problem: Problem, panel: str, seed: int) -> Drawn:
     """Draw a gold reward, a pool of answers and preferences, and fit the reward models.
 
+    Examples:
+        >>> drawn = draw(Problem(pool=10_000, models=3, width=8), "independent", seed=0)
+        >>> drawn.gold.shape, drawn.scores.shape
+        ((10000,), (10000, 3))
+
     Args:
         problem: The sizes.
         panel: One of ``PANELS``.
-        seed: Everything random comes from it.
+        seed: Everything random comes from it; >= 0.
 
     Raises:
         UnknownNameError: for another panel, with the nearest name.
@@ -202,6 +224,14 @@ def filtered(scores: np.ndarray, mitigation: Mitigation) -> np.ndarray:
 
     The scores are the ratings and their mean is the observed reward. Every answer is rated once by all models, so a
     mitigation that has a pseudo-count should have it at 0.
+
+    Examples:
+        >>> filtered(np.array([[1.0, 1.0], [0.0, 4.0]]), named("worst-of-annotations")).tolist()
+        [1.0, 0.0]
+
+    Args:
+        scores: (N, K), finite.
+        mitigation: Ours, or your own.
     """
     reward = scores.mean(1)
     feedback = aggregate(scores, reward)
@@ -230,6 +260,12 @@ METHODS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 @dataclass(frozen=True)
 class Result:
     """Curves of every method.
+
+    Examples:
+        >>> curves = {("independent", "uard"): np.array([[0.0, 1.0], [0.0, 3.0]])}  # two seeds, n = 1 and n = 10
+        >>> result = Result(Problem(), seeds=(0, 1), sizes=(1, 10), gold=curves, proxy=curves)
+        >>> result.as_data()["curves"][0]["gold"]["mean"]
+        [0.0, 2.0]
 
     Attributes:
         problem: The sizes.
@@ -276,10 +312,20 @@ def _summaries(values: np.ndarray) -> dict[str, list[Any]]:
 def run(seeds: Sequence[int], problem: Problem | None = None, panels: Sequence[str] = PANELS) -> Result:
     """Draw every seed of every panel and follow every method from n = 1 to 10 000.
 
+    Examples:
+        >>> small = Problem(pool=10_000, models=3, pairs=60, width=8)
+        >>> result = run([0], small, panels=["independent"])
+        >>> result.sizes[-1], result.gold["independent", "uard"].shape
+        (10000, (1, 24))
+
     Args:
-        seeds: Seeds, at least one; all methods see the same draws.
+        seeds: Seeds >= 0, at least one; all methods see the same draws.
         problem: The sizes; the default ones if left out.
         panels: Some of ``PANELS``.
+
+    Raises:
+        InvalidValueError: there is no seed.
+        UnknownNameError: for another panel, with the nearest name.
     """
     problem = problem or Problem()
     _checks.whole("number of seeds", len(seeds), low=1)

@@ -21,5 +21,13 @@ TRAINERS: tuple[Trainer, ...] = (
 
 
 def trainer_of(agent: Any, environment: Any) -> Trainer | None:
-    """Return who trains such an agent in such an environment; None if that cannot be."""
+    """Return who trains such an agent in such an environment; None if that cannot be.
+
+    Examples:
+        >>> from uard.lab.registry import AGENTS, ENVIRONMENTS
+        >>> trainer_of(AGENTS["dqn"], ENVIRONMENTS["CartPole"]).name
+        'compiled-replay'
+        >>> trainer_of(AGENTS["q-learning"], ENVIRONMENTS["CartPole"]) is None  # no tables are that large
+        True
+    """
     return next((trainer for trainer in TRAINERS if trainer.serves(agent, environment)), None)

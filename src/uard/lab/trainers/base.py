@@ -23,6 +23,12 @@ Finish = Callable[[], Result]  # of one job; raises DivergedError if that diverg
 class Trainer(ABC):
     """A kind of training.
 
+    Examples:
+        >>> from uard.lab.cell import Cell
+        >>> trainer = Cell().trainer
+        >>> trainer.name, trainer.budget, trainer.families, [*trainer.rating_models]
+        ('tabular', 'episodes', ('tabular',), ['table'])
+
     Attributes:
         name: Part of the keys of its cells.
         version: Part of them, too: a whole number that is raised when the code of this kind of training changes what

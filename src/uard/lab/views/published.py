@@ -3,7 +3,12 @@
 ``uard reproduce STUDIES --extract FILE`` writes what the report needs of finished studies as one small JSON file:
 metrics per seed, binned curves, what was derived from tables, and how it was made. The report reads the packaged ones;
 a row that is not in them, or whose configuration has changed since (its key then differs), is shown as missing, never
-guessed.
+guessed. Here with a store that is filled by hand:
+
+    >>> cell, store = Cell(episodes=20), Store(":memory:")
+    >>> study = Study("mine", "Without a mitigation", "", (Row((("mitigation", "raw"),), cell),), curves=("hacks",))
+    >>> results = [Result(np.full((20, 6), x), steps=20, path=np.array([0]), extra={}) for x in (1.0, 2.0)]
+    >>> store.put([(cell, seed, result) for seed, result in enumerate(results)])
 """
 
 from __future__ import annotations
@@ -42,6 +47,11 @@ BIN = 10  # episodes
 class ResultFiles:
     """Published results of one package (what an entry point of ``uard.results`` returns).
 
+    Examples:
+        >>> files = ResultFiles(resources.files("uard.lab.published"), studies=("games.json",))
+        >>> (files.folder / "games.json").is_file()
+        True
+
     Attributes:
         folder: Holds JSON files (``packaged_json``).
         studies: Names of those that ``uard reproduce --extract`` wrote; of a cell in several of them the last is taken.
@@ -52,7 +62,19 @@ class ResultFiles:
 
 
 def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], command: str) -> dict[str, Any]:
-    """Gather what the report needs of some studies as plain data; a row counts when all its seeds are finished."""
+    """Gather what the report needs of some studies as plain data; a row counts when all its seeds are finished.
+
+    Examples:
+        >>> data = extract([study], store, seeds=[0, 1], command="uard reproduce mine --extract mine.json")
+        >>> data["cells"][cell.key]["metrics"]["hacks"]
+        [1.0, 2.0]
+
+    Args:
+        studies: With the curves and the derived numbers that each of them names.
+        store: What it lacks is left out.
+        seeds: All that a row must have.
+        command: What made it, for the reader.
+    """
     wanted: dict[Cell, dict[str, Study]] = {}
     for study in studies:
         for r in study.rows:
@@ -66,7 +88,7 @@ def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], comman
     return {
         "command": command,
         "version": __version__,
-        "commit": checkout(),
+        "commit": _checkout(),
         "format": FORMAT,
         "packages": {p: metadata.version(p) for p in packages} | {"python": platform.python_version()},
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
@@ -74,7 +96,7 @@ def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], comman
     }
 
 
-def checkout() -> str | None:
+def _checkout() -> str | None:
     """Return the commit of the checkout that this code stands in, and whether it was changed; None if it is in none."""
     here = Path(__file__)
 
@@ -121,6 +143,15 @@ def _binned(curve: np.ndarray) -> np.ndarray:
 
 class Published:
     """Published results of some studies.
+
+    Methods that take a row want one that was published (``has``), and raise KeyError for another.
+
+    Examples:
+        >>> published = Published([study], [extract([study], store, seeds=[0, 1], command="made by hand")])
+        >>> published.get("mine", "hacks", mitigation="raw").mean
+        1.5
+        >>> published.curves(study.rows[0], "hacks").shape
+        (2, 2)
 
     Attributes:
         studies: By name.
@@ -191,7 +222,14 @@ class Published:
 
 
 def packaged_json(name: str) -> Any:
-    """Return a packaged file's numbers, ours or a package's, or None if there is none."""
+    """Return a packaged file's numbers, ours or a package's, or None if there is none.
+
+    Examples:
+        >>> packaged_json("best-of-n.json")["problem"]["models"]
+        5
+        >>> packaged_json("no-such-file.json") is None
+        True
+    """
     for place in _places():
         if (file := place.folder / name).is_file():
             return json.loads(file.read_text(encoding="utf-8"))
@@ -208,7 +246,12 @@ def packaged() -> Published:
 
 
 def broken() -> list[PluginError]:
-    """Return an error for each package's published results that cannot be used."""
+    """Return an error for each package's published results that cannot be used.
+
+    Examples:
+        >>> [str(error) for error in broken()]
+        []
+    """
     return brought("results", _checked)[1]
 
 

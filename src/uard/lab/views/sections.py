@@ -17,6 +17,12 @@ PAGES = ("index.html", "leaderboard.html")  # that stand beside what sections wr
 class Section:
     """A part of the report.
 
+    Examples:
+        >>> from markupsafe import escape
+        >>> text = escape("Hacks < 0.1 at a slack of 0.2.")
+        >>> Section("ceiling", "The ceiling", order=65.0, html=f"<p>{text}</p>").html
+        '<p>Hacks &lt; 0.1 at a slack of 0.2.</p>'
+
     Attributes:
         id: Where links lead to: letters, digits and hyphens, as in HTML.
         title: Its heading.
@@ -42,7 +48,11 @@ class Section:
     files: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check the fields."""
+        """Check the fields.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         if not re.fullmatch(r"[a-z][a-z0-9-]*", self.id):
             raise _checks.InvalidValueError("id", self.id, "small letters, digits and hyphens")
         _checks.number("order", self.order)

@@ -17,6 +17,17 @@ from uard.lab.study import Row, Study, metrics_of, results_of
 class StudyResults:
     """Finished studies over some seeds.
 
+    Seeds that are not in the store and unknown names of studies and metrics are a LookupError.
+
+    Examples:
+        >>> cell, store = Cell(episodes=20), Store(":memory:")
+        >>> study = Study("mine", "Without a mitigation", "", (Row((("mitigation", "raw"),), cell),))
+        >>> finished = [Result(np.full((20, 6), x), steps=20, path=np.array([0]), extra={}) for x in (1.0, 2.0)]
+        >>> store.put([(cell, seed, result) for seed, result in enumerate(finished)])  # as ``runner.run`` does
+        >>> results = StudyResults(store, seeds=[0, 1], studies=[study])
+        >>> results.get("mine", "hacks", mitigation="raw").mean, results.curves("mine", "hacks").shape
+        (1.5, (2, 20))
+
     Attributes:
         seeds: The seeds, in order.
         studies: By name.

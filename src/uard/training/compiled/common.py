@@ -287,7 +287,7 @@ def finished(
 
     _, walk = lax.scan(timed, (world.reset(key), jnp.asarray(False)), (times, keys))
     return TrainedAgent(
-        log=carry.log[:-1],
+        log=carry.log[:-1],  # what came after the last episode that counts was put into the last row
         episodes=jnp.minimum(carry.episode, program.episodes),
         steps=carry.steps,
         walk=walk,

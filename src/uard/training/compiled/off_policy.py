@@ -47,7 +47,24 @@ class _Row(NamedTuple):
 
 
 def train_one(run: Run, program: Program) -> TrainedAgent:
-    """Train one run (pure; jit and vmap it at will)."""
+    """Train one run (pure; jit and vmap it at will).
+
+    Examples:
+        >>> from uard.agents.networks import Network
+        >>> from uard.agents.value import DeepQ
+        >>> from uard.envs.grids.trapgrid import TrapGrid
+        >>> from uard.method.mitigations import named
+        >>> from uard.ratings.panels import MAIN
+        >>> agent = DeepQ(network=Network(hidden=8), batch=8, warmup=8)
+        >>> run = common.make_run(TrapGrid(size=3).world(MAIN), agent, named("raw"), seed=0)
+        >>> trained = jax.jit(train_one, static_argnames="program")(run, Program(episodes=5))
+        >>> trained.log.shape, common.QUANTITIES[trained.fault]
+        ((5, 6), 'nothing')
+
+    Args:
+        run: Its agent is an ``OffPolicy``; see ``uard.training.compiled.common.make_run``.
+        program: What is fixed when the program is compiled.
+    """
     world, agent, mitigation = run.world, cast(OffPolicy, run.agent), run.mitigation
     source = FeedbackSource(run, program)
     observe = jax.vmap(world.observe)
@@ -99,6 +116,7 @@ def train_one(run: Run, program: Program) -> TrainedAgent:
         buffer = store_transition(c, action, after, mask_key)
         learner, info = c.agent, UpdateInfo(jnp.float32(0.0), jnp.float32(0.0))
         if learns:
+            # With what was just said of this step: it may be drawn at once.
             learner, info = update(c._replace(known=known), buffer, draw_key, learn_key)
         sums, log = log_step(c, action, after)
         done = common.is_over(world, c.time, after)

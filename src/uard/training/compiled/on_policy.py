@@ -58,6 +58,22 @@ def train_one(run: Run, program: Program) -> TrainedAgent:
     Episodes are logged in the order in which they ended, whichever copy of the world they were in; those that end
     together, in the order of the copies. What ends beyond ``program.episodes`` in the last rollout is dropped, though
     it was learned from. ``program.steps`` counts the steps of all copies.
+
+    Examples:
+        >>> from uard.agents.networks import SINGLE, Network
+        >>> from uard.agents.policy import PPO
+        >>> from uard.envs.grids.trapgrid import TrapGrid
+        >>> from uard.method.mitigations import named
+        >>> from uard.ratings.panels import MAIN
+        >>> agent = PPO(network=Network(hidden=8), ensemble=SINGLE, envs=2, rollout=16)
+        >>> run = common.make_run(TrapGrid(size=3).world(MAIN), agent, named("raw"), seed=0)
+        >>> trained = jax.jit(train_one, static_argnames="program")(run, Program(episodes=5))
+        >>> trained.log.shape, common.QUANTITIES[trained.fault]
+        ((5, 6), 'nothing')
+
+    Args:
+        run: Its agent is a ``PolicyGradient``; see ``uard.training.compiled.common.make_run``.
+        program: What is fixed when the program is compiled.
     """
     world, agent, mitigation = run.world, cast(PolicyGradient, run.agent), run.mitigation
     source = FeedbackSource(run, program)
@@ -96,6 +112,7 @@ def train_one(run: Run, program: Program) -> TrainedAgent:
             row, key = x
             return source.collect(known, row.state, row.action, row.after, key), None
 
+        # One step after the other: several may be of one state-action, whose running means each of them moves.
         known, _ = lax.scan(collect, c.known, (flat, jax.random.split(panel_key, total)))
         model, _ = lax.scan(
             lambda model, key: (source.fit(known, model, key), None), c.model, jax.random.split(model_key, fits)
@@ -158,6 +175,7 @@ def train_one(run: Run, program: Program) -> TrainedAgent:
             place=place,
             known=known,
             model=model,
+            # This rollout included: the bonus divides by their root.
             visits=c.visits.at[jax.vmap(world.slot)(flat.state, flat.action)].add(1.0),
             episode=episode,
             log=log,

@@ -130,6 +130,20 @@ def train_one(run: Run, program: Program) -> TrainedTables:
 
     The barriers keep XLA from computing values again inside the writes to the tables, which would then need a copy of
     a whole table at every step.
+
+    Examples:
+        >>> from uard.envs.grids.trapgrid import TrapGrid
+        >>> from uard.method.mitigations import named
+        >>> from uard.ratings.panels import MAIN
+        >>> grid = TrapGrid(size=3)
+        >>> run = make_run(grid.task(), grid.rating_law(MAIN), grid.truth(), QLearning(), named("uard"), seed=0)
+        >>> trained = jax.jit(train_one, static_argnames="program")(run, Program(episodes=5))
+        >>> trained.log.shape, trained.q.shape  # the tables are padded
+        ((5, 6), (100, 4, 5))
+
+    Args:
+        run: See ``make_run``.
+        program: What is fixed when the program is compiled.
     """
     task, agent, mitigation = run.task, run.agent, run.mitigation
     states, actions = task.next_state.shape
@@ -210,6 +224,7 @@ def train_one(run: Run, program: Program) -> TrainedTables:
         return sums, lax.dynamic_update_slice(c.log, sums[None], (jnp.minimum(c.episode, program.episodes), 0))
 
     def one_step(c: _Carry, draws: _Draws) -> tuple[_Carry, None]:
+        # A chunk goes on after the last episode, but to no effect: nothing is rated, learned or counted then.
         active = (c.episode < program.episodes).astype(jnp.float32)
         action, abstained = select_action(c, draws.agent.explore, draws.agent.action)
         if asks_raters:
@@ -273,7 +288,8 @@ def train_one(run: Run, program: Program) -> TrainedTables:
     c, _, q_kept, rows_kept = lax.while_loop(
         lambda loop: loop[0].episode < program.episodes, chunk, (start, jnp.uint32(1), *kept)
     )
-    return TrainedTables(c.log[:-1], c.steps, c.q, from_rows(c.rows), q_kept, from_rows(rows_kept))
+    log = c.log[:-1]  # what came after the last episode was put into the last row
+    return TrainedTables(log, c.steps, c.q, from_rows(c.rows), q_kept, from_rows(rows_kept))
 
 
 def _key(seed: Array, number: Array) -> Array:

@@ -69,12 +69,20 @@ def remember(known: Memory, slot: Array, state: Any, action: Array, visit: Feedb
 class RatingModel:
     """An ensemble regression on the rated steps.
 
+    Examples:
+        >>> RatingModel(members=3, hidden=16).fits
+        16
+        >>> RatingModel(members=1)
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: members = 1: must be a whole number in [2, 64]
+
     Attributes:
-        members: Networks, >= 2.
-        hidden: Width of their one hidden layer.
-        learning_rate: Adam's step size.
-        fits: Minibatches per chunk of environment steps.
-        batch: Distinct rated steps per minibatch.
+        members: Networks, in [2, 64].
+        hidden: Width of their one hidden layer, in [1, 4096].
+        learning_rate: Adam's step size, in (0, 1].
+        fits: Minibatches per chunk of environment steps, in [1, 10000].
+        batch: Distinct rated steps per minibatch, in [1, 65536].
         prior_scale: Size of the fixed random functions that make members disagree where nobody rated, in units of the
             ratings' deviation, > 0.
     """
@@ -87,7 +95,11 @@ class RatingModel:
     prior_scale: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.whole("members", self.members, low=2, high=64)
         _checks.whole("hidden", self.hidden, low=1, high=4096)
         _checks.number("learning_rate", self.learning_rate, low=0, high=1, open_low=True)

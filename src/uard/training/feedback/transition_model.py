@@ -37,15 +37,23 @@ QUERIES = ("random", "doubtful")  # which steps are rated
 class TransitionModel:
     """An ensemble regression on a sample of rated steps.
 
+    Examples:
+        >>> TransitionModel(members=3, capacity=1000).fits
+        200
+        >>> TransitionModel(batch=256, capacity=100)
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: capacity = 100: must be a whole number in [256, 1e+07]
+
     Attributes:
-        members: Networks, >= 2.
-        hidden: Width of their two hidden layers.
-        learning_rate: Adam's step size.
-        fits: Minibatches per fit; there is one fit per 2048 environment steps.
-        batch: Rated steps per minibatch.
+        members: Networks, in [2, 64].
+        hidden: Width of their two hidden layers, in [1, 4096].
+        learning_rate: Adam's step size, in (0, 1].
+        fits: Minibatches per fit, in [1, 100000]; there is one fit per 2048 environment steps.
+        batch: Rated steps per minibatch, in [1, 65536].
         prior_scale: Size of the fixed random functions, in units of the ratings' deviation, > 0. It says how much is
             unknown before anybody rates: where noise makes the members differ by as much, nothing counts as known.
-        capacity: Rated steps kept.
+        capacity: Rated steps kept, >= ``batch``.
         deviations: Deviations of the members, >= 0, by which differences are reduced before they count; see
             ``soft_threshold``.
     """
@@ -60,7 +68,11 @@ class TransitionModel:
     deviations: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         _checks.whole("members", self.members, low=2, high=64)
         _checks.whole("hidden", self.hidden, low=1, high=4096)
         _checks.number("learning_rate", self.learning_rate, low=0, high=1, open_low=True)

@@ -38,13 +38,13 @@ class Job:
         agent: Who learns.
         mitigation: What it does about a reward that may lie.
         seed: Of everything.
-        steps: Environment steps, of all copies together.
+        steps: Environment steps, of all copies together, >= 1; the last piece is finished, which may be some more.
         panel: Who rates.
-        noise: Extra noise of every rater, in reward units.
-        rated: Fraction of steps that are rated.
+        noise: Extra noise of every rater, in reward units, >= 0.
+        rated: Fraction of steps that are rated, in [0, 1].
         rating_model: The model of the ratings.
         ddof: Of the raters' deviation.
-        evaluations: Episodes without exploration after training.
+        evaluations: Episodes without exploration after training, in [1, 1000].
         query: Which steps are rated; see ``transition_model.chosen``.
     """
 
@@ -62,7 +62,11 @@ class Job:
     query: str = "random"
 
     def __post_init__(self) -> None:
-        """Check the parameters."""
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
         if not isinstance(self.panel, Panel):
             raise _checks.InvalidValueError("panel", self.panel, "a Panel (see uard.ratings.panels.PANELS)")
         _checks.number("noise", self.noise, low=0)
@@ -274,15 +278,28 @@ def run(
 ) -> TrainedRun:
     """Train, going on from the checkpoint at ``path`` if there is one.
 
+    Examples:
+        >>> from uard.agents.networks import SINGLE, Network
+        >>> from uard.agents.policy import PPO
+        >>> from uard.envs.locomotion.inverted_pendulum import InvertedPendulum
+        >>> from uard.method.mitigations import named
+        >>> from uard.training.host.loops import loop_of
+        >>> agent = PPO(network=Network(hidden=8), ensemble=SINGLE, envs=2, rollout=16)
+        >>> job = Job(InvertedPendulum(horizon=20), agent, named("raw"), steps=64, evaluations=3)
+        >>> trained = run(loop_of(job))
+        >>> int(trained.state.steps), trained.evaluation.shape
+        (64, (3, 7))
+
     Args:
         loop: Of the run; ``uard.training.host.loops.loop_of`` finds it.
         path: Where to keep the checkpoint; nowhere if None.
-        config: What the run is, as text, so that no other run's checkpoint is gone on from.
+        config: What the run is, as one line of text, so that no other run's checkpoint is gone on from.
         every: Environment steps between checkpoints.
         progress: Called with (steps done, steps to do).
         stop: Asked after each piece; True writes a checkpoint and raises KeyboardInterrupt.
 
     Raises:
+        KeyboardInterrupt: ``stop`` said so.
         FloatingPointError: a parameter or the physics left the finite numbers; names the quantity and the step. The
             last good checkpoint is kept.
         CheckpointError: the checkpoint is truncated, or of another configuration.
@@ -323,6 +340,7 @@ def evaluate(loop: Loop, state: TrainState) -> np.ndarray:
     going = np.ones(job.evaluations, bool)
     while going.any():
         result = simulator.step(np.clip(loop.act(state, simulator.observe()), -1.0, 1.0))
+        # A copy whose episode has ended begins another, which is not counted: each gives one, however long.
         rows[going] += np.column_stack([counted(result), result.task_reward])[going]
         going &= ~(result.terminated | result.truncated)
     simulator.close()

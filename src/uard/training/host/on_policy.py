@@ -74,6 +74,7 @@ class OnPolicyLoop(Loop):
         learner = self._update(state, rollout, inputs, model, number)
         return TrainState(
             agent=learner,
+            # Not before: an update needs the observations as the policy that took the actions saw them.
             norm=state.norm.after(np.concatenate(rollout.observations[:-1])),
             model=model,
             reservoir=state.reservoir,
