@@ -15,7 +15,7 @@ test: $(VENV)/.test
 	$(BIN)/pyright
 	$(BIN)/lint-imports --no-cache
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist worksteal
 
 bench: $(VENV)/.test
 	$(BIN)/python benchmarks/tabular.py

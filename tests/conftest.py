@@ -8,10 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-# Processes of a test run, and the next run, share what they have compiled.
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / "uard" / "xla-tests"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
-
+import quick  # isort: skip  (sets what JAX reads when it is imported)
 import shapes  # noqa: F401  isort: skip  (checks the arrays of what is imported of uard after it)
 import uard.training  # noqa: F401  isort: skip  (sets XLA's flags, which must come before the first use of JAX)
 import jax
@@ -42,6 +39,13 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Abstract
             yield root / name
 
     return locked
+
+
+@pytest.fixture
+def as_users_compile(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give the processes that a test starts the flags and the cache of compiled programs that users have."""
+    for name in quick.SETTINGS:
+        monkeypatch.delenv(name)
 
 
 @dataclass(frozen=True)
