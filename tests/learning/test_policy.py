@@ -145,8 +145,9 @@ def test_the_plain_agent_solves_an_honest_grid(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("trap", "panel"), [(4.0, "main"), (8.0, "appendix")])
-@pytest.mark.parametrize("name", AGENTS)
+@pytest.mark.parametrize(
+    ("name", "trap", "panel"), [*((name, 4.0, "main") for name in AGENTS), ("ppo", 8.0, "appendix")]
+)
 def test_uard_leaves_the_traps_and_reaches_the_goal(name, trap, panel):
     last = on_grid(AGENTS[name], "uard", range(5), trap, panel)
     assert (last[:, VISITS] <= 0.5).all()

@@ -44,7 +44,7 @@ def modules(*packages):
 @pytest.mark.parametrize(
     "names",
     [
-        *modules("adapters"),
+        ", ".join(modules("adapters")),
         ", ".join(modules("method", "ratings", "judges", "diagnosis")),
         "uard.cli.app, uard.plugins",
     ],

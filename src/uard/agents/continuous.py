@@ -63,7 +63,7 @@ class ContinuousActorCritic(Agent):
         ucb: SUNRISE's bonus for disagreement, in deviations, >= 0.
         backup_temperature: SUNRISE's T >= 0; 0 weighs all backups alike.
         tau: Share in (0, 1] of the critics that each update mixes into the target network.
-        buffer: Transitions kept, >= ``batch``.
+        buffer: Transitions kept, >= ``batch``; rounded up to a multiple of 32.
         batch: Transitions per update, in [1, 65536]; there is one update per step.
         warmup: Steps of uniformly random actions before the first update, >= ``batch``.
         bootstrap: Chance that a critic learns from a transition, in [1/256, 1].

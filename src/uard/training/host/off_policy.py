@@ -49,7 +49,8 @@ class OffPolicyLoop(Loop):
         self.job, self.copies = job, 1
         self._fixed = job.fixed
         self._width = transitions.width(job.environment.features, job.environment.actions)
-        self._slots = min(job.agent.buffer, -(-job.steps // PIECE) * PIECE)
+        # Whole pieces: one that began before the end of the buffer and went beyond it would be written elsewhere.
+        self._slots = -(-min(job.agent.buffer, job.steps) // PIECE) * PIECE
 
     def start(self, simulator: Simulator) -> TrainState:
         """Return the first state."""
