@@ -81,9 +81,9 @@ def _compiled(name: str, task: str, seeds: int) -> Returns:
     from uard.agents.value import DeepQ
     from uard.envs.classic.specs import Acrobot, CartPole
     from uard.method.mitigations import named
+    from uard.ratings.panels import PANELS
     from uard.training.compiled import common as deep
-    from uard.training.compiled import off_policy, on_policy
-    from uard.training.compiled import runs as lanes
+    from uard.training.compiled import off_policy, on_policy, runs
     from uard.training.episode_log import LOG
 
     network = Network(learning_rate=RATE, value_scale=VALUE_SCALE.get((name, task), 30.0))
@@ -93,12 +93,12 @@ def _compiled(name: str, task: str, seeds: int) -> Returns:
         "trpo": TRPO(network, gamma=GAMMA, count_bonus=0.0),
     }
     budget = BUDGETS[name, task]
-    world = (CartPole() if task == "CartPole" else Acrobot()).world()
-    loop = off_policy.run if name == "dqn" else on_policy.run
+    world = (CartPole() if task == "CartPole" else Acrobot()).world(PANELS["main"])
+    loop = off_policy.train_one if name == "dqn" else on_policy.train_one
     program = deep.Program(budget // 8, budget)
-    several = [deep.lane(world, agents[name], named("raw"), seed) for seed in range(seeds)]
+    several = [deep.make_run(world, agents[name], named("raw"), seed) for seed in range(seeds)]
     found = []
-    for out in lanes.train(several, loop, program, deep.Outcome._fields, deep.ROOM):
+    for out in runs.train(several, loop, program, deep.TrainedAgent._fields, deep.ROOM):
         assert not out["fault"], deep.QUANTITIES[int(out["fault"])]
         log = out["log"][: int(out["episodes"])]
         ends = np.cumsum(log[:, LOG.index("length")])

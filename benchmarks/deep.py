@@ -64,20 +64,20 @@ def ours(kind: str, members: int, mitigation: str) -> Callable[[int], float]:
     from uard.agents.value import DeepQ
     from uard.envs.grids.trapgrid import paper_grid
     from uard.method.mitigations import named
+    from uard.ratings.panels import PANELS
     from uard.training.compiled import common as deep
-    from uard.training.compiled import off_policy
-    from uard.training.compiled import runs as lanes
+    from uard.training.compiled import off_policy, runs
     from uard.training.feedback.rating_model import RatingModel
 
     agent = DeepQ(ensemble=Ensemble(kind, members), buffer=BUFFER, batch=BATCH, warmup=WARMUP, target_every=TARGET)
-    world = paper_grid(10, horizon=100).world()
-    feedback = RatingModel() if mitigation != "raw" else None
+    world = paper_grid(10, horizon=100).world(PANELS["main"])
+    model = RatingModel() if mitigation != "raw" else None
 
     def run(steps: int) -> float:
         program = deep.Program(10**6 // 100, steps)
-        lane = deep.lane(world, agent, named(mitigation), 0, feedback=feedback)
+        one = deep.make_run(world, agent, named(mitigation), 0, rating_model=model)
         start = time.perf_counter()
-        (out,) = lanes.train([lane], off_policy.run, program, ("steps", "fault"), deep.ROOM)
+        (out,) = runs.train([one], off_policy.train_one, program, ("steps", "fault"), deep.ROOM)
         return float(out["steps"]) / (time.perf_counter() - start)
 
     jax.config.update("jax_compilation_cache_dir", None)

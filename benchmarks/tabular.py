@@ -39,7 +39,7 @@ from rich.table import Table
 from uard.agents.tabular import QLearning
 from uard.envs.grids.trapgrid import paper_grid
 from uard.method.mitigations import named
-from uard.ratings import panels
+from uard.ratings.panels import PANELS
 from uard.training.compiled import tabular as fused
 from uard.training.episode_log import LOG
 
@@ -163,13 +163,13 @@ def python_loop(seconds: float) -> Callable[[int], Run]:
     return turn
 
 
-def fused_program(mitigation: str, lanes: int) -> Callable[[int], Run]:
-    """The library's compiled program on ``lanes`` runs, one after the other."""
+def fused_program(mitigation: str, count: int) -> Callable[[int], Run]:
+    """The library's compiled program on ``count`` runs, one after the other."""
     task, truth = GRID.task(), GRID.truth()
-    said, program = panels.ratings("main", task, truth), fused.Program(EPISODES)
+    law, program = GRID.rating_law(PANELS["main"]), fused.Program(EPISODES)
 
     def turn(seed: int) -> Run:
-        batch = [fused.lane(task, said, truth, AGENT, named(mitigation), seed=seed * lanes + i) for i in range(lanes)]
+        batch = [fused.make_run(task, law, truth, AGENT, named(mitigation), seed * count + i) for i in range(count)]
         begun = time.perf_counter()
         out = fused.train(batch, program)
         seconds = time.perf_counter() - begun
@@ -320,7 +320,7 @@ def main() -> None:
     compiler_path = compiler()
     with tempfile.TemporaryDirectory() as folder:
         contenders = {PYTHON: python_loop(3.0 / arguments.repetitions)}
-        contenders |= {f"fused, {name}": fused_program(name, lanes=64) for name in MITIGATIONS}
+        contenders |= {f"fused, {name}": fused_program(name, count=64) for name in MITIGATIONS}
         if compiler_path:
             contenders[C] = c_loop(compiler_path, Path(folder), runs=128, masks=False)
             contenders[C_MASKS] = c_loop(compiler_path, Path(folder), runs=128, masks=True)

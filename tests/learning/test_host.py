@@ -193,8 +193,8 @@ def test_a_state_that_is_not_finite_stops_the_run_and_the_last_good_one_stays(tm
 def test_ppo_learns_to_stay_up_on_the_honest_hopper():
     """On six seeds together the last 50 episodes last more than twice as long as the first 50.
 
-    By about 20 and 80 steps here. Under the hypothesis that they do not, the difference has either sign equally often in
-    each seed: p = 1/64 if all six have the same.
+    By about 20 and 80 steps here. Under the hypothesis that they do not, the difference has either sign equally often
+    in each seed: p = 1/64 if all six have the same.
     """
     ppo = continuous_agents()["ppo"]
     logs = [run(Job(Locomotion(region=None), ppo, named("raw"), seed, 14_336, evaluations=1)).log for seed in range(6)]
