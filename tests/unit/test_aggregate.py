@@ -272,3 +272,16 @@ def test_every_array_library_gives_the_same(backend, case):
 def test_nan_is_a_missing_rating_in_every_array_library(backend):
     if not backend.jit:
         backend.agrees(aggregate, np.where(MASK, RATINGS, NAN), PROXY)
+
+
+@pytest.mark.parametrize("mask", [np.array([[2, 0]]), np.array([[0.5, np.nan]])])
+def test_a_mask_that_is_not_of_truth_values_is_refused(mask):
+    with pytest.raises(InvalidValueError, match=r"mask\.dtype = .*truth values"):
+        aggregate(np.array([[5.0, 1.0]]), np.array([0.0]), mask)
+
+
+@pytest.mark.parametrize("name", ["ratings", "proxy", "mask"])
+def test_what_is_no_array_is_refused_by_name(name):
+    given = {"ratings": np.zeros((1, 2)), "proxy": np.zeros(1), "mask": np.ones((1, 2), bool)}
+    with pytest.raises(InvalidValueError, match=rf"^{name} = .*an array"):
+        aggregate(**(given | {name: [[1.0]]}))

@@ -9,13 +9,15 @@ import subprocess
 import sys
 import typing
 from dataclasses import dataclass, field, replace
+from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import uard
-from uard import InvalidValueError, LearningSignal, Mitigation, RewardDiscounting
+from uard import InvalidValueError, LearningSignal, Mitigation, RewardDiscounting, plugins
 from uard.agents.base import Agent
 from uard.agents.tabular import QLearning
 from uard.envs.base import Environment
@@ -266,9 +268,21 @@ def test_a_class_that_moves_keeps_its_key_and_no_other_package_can_take_it():
     assert ours == Cell(mitigation=Screening(0.5)).key
     homes = [another("Screening", m)() for m in ("theirs", "theirs.deeper.still", "uardian", "theirs2.uard")]
     theirs = [Cell(mitigation=m).key for m in homes]
-    assert theirs[0] == theirs[1]
-    assert len({ours, *theirs}) == 4
-    assert [type_name(type(m)) for m in homes[1:3]] == ["theirs/Screening", "uardian/Screening"]
+    assert len({ours, *theirs}) == 5, "a package may have two classes of one name"
+    assert [type_name(type(m)) for m in homes[1:3]] == ["theirs.deeper.still/Screening", "uardian/Screening"]
+
+
+def test_a_registered_class_of_another_package_may_move(monkeypatch):
+    keys = set()
+    for module in ("theirs", "theirs.deeper.still"):
+        kind = another("Screening", module)
+        monkeypatch.setitem(sys.modules, module, SimpleNamespace(Screening=kind))
+        entry = EntryPoint("screening", f"{module}:Screening", plugins.NAMED["mitigation"])
+        found = (plugins.Plugin("mitigation", "screening", "theirs 1.0", entry),)
+        monkeypatch.setattr(plugins, "found", lambda kind, found=found: found)
+        keys.add(Cell(mitigation=kind()).key)
+        assert type_name(kind) == "theirs/Screening"
+    assert len(keys) == 1
 
 
 def test_no_two_classes_of_ours_that_can_be_in_a_cell_have_one_name():

@@ -281,7 +281,7 @@ def test_what_other_packages_bring_has_the_name_of_its_package():
     old = rows(HERE / "format-2.sqlite", "select config from cells where config like '%SoftActorCritic%'")[0][0]
     theirs = json.loads(old.replace("uard.mitigation.Raw", "pack.deep.inside.Own"))
     config = new_config(theirs)
-    assert config == plain(cell) | {"mitigation": {"type": "pack/Own"}}
+    assert config == plain(cell) | {"mitigation": {"type": "pack.deep.inside/Own"}}
     assert new_key(config, theirs) != cell.key
     theirs["agent"]["class"] = f"{__name__}.Theirs"
     sys.modules.setdefault(__name__, sys.modules[Theirs.__module__])
@@ -325,8 +325,9 @@ def test_a_store_at_work_is_not_migrated(old):
 
 def test_nothing_is_migrated_twice_or_over_a_backup(old, tmp_path):
     again = Path(shutil.copy(old, tmp_path / "again.sqlite"))
-    (tmp_path / "s.sqlite.migrating").write_text("left by a process that was killed")
+    (tmp_path / "s.sqlite.migrating").write_text("mine")
     migrate(old)
+    assert (tmp_path / "s.sqlite.migrating").read_text() == "mine"
     with pytest.raises(StoreError, match="is of format 3 already; there is nothing to migrate"):
         migrate(old)
     (tmp_path / "again.sqlite.format-2").write_text("mine")
@@ -334,6 +335,55 @@ def test_nothing_is_migrated_twice_or_over_a_backup(old, tmp_path):
         migrate(again)
     assert (tmp_path / "again.sqlite.format-2").read_text() == "mine"
     assert again.read_bytes() == (HERE / "format-2.sqlite").read_bytes()
+
+
+def test_a_link_is_followed_and_the_file_behind_it_migrated(old, tmp_path):
+    link, before = tmp_path / "link.sqlite", old.read_bytes()
+    link.symlink_to(old)
+    found = migrate(link)
+    assert link.is_symlink()
+    assert found.backup == Path(f"{old}.format-2")
+    assert found.backup.read_bytes() == before
+    with closing(Store(link)) as store:
+        assert store.count()[1] == store_seeds()
+
+
+def test_a_link_that_leads_nowhere_takes_the_place_of_the_backup(old, tmp_path):
+    Path(f"{old}.format-2").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(InvalidValueError, match=r"move .* away"):
+        migrate(old)
+    assert not (tmp_path / "nowhere").exists()
+
+
+@pytest.mark.parametrize("garbage", ["garbage", "[]", "7", "[" * 100_000, '{"class": 5}', '{"colour": "red"}'])
+def test_a_row_that_is_garbage_is_told_and_stays_in_the_backup(old, garbage):
+    raw = key_of(old, "QLearning%mitigation.Raw")
+    if "colour" in garbage:
+        (text,) = rows(old, f"select config from cells where key = '{raw}'")[0]
+        garbage = json.dumps(json.loads(text) | {"colour": "red"})
+    change(old, ("update cells set config = ? where key = ?", garbage, raw))
+    change(old, ("update results set data = 'text' where rowid = (select max(rowid) from results)",))
+    found = migrate(old)
+    assert found.cells == len(CELLS) - 1
+    assert any("no cell of format 2 looked like that" in why for why in found.left)
+    assert found.rows["quarantine"] == 1
+
+
+@pytest.mark.parametrize("garbage", ["text", {}, {"config": {"class": 5}, "seeds": [0], "metrics": {}}])
+def test_a_published_cell_that_is_garbage_is_told_and_stays_in_the_backup(tmp_path, garbage):
+    file = tmp_path / "p.json"
+    file.write_text(json.dumps({"results": 2, "cells": {"x": garbage}}))
+    found = migrate(file)
+    assert (found.cells, sum(found.left.values())) == (0, 1)
+
+
+def test_published_numbers_that_are_none_change_nothing(old, tmp_path):
+    config = json.loads(rows(old, "select config from cells")[0][0])
+    file, nan = tmp_path / "p.json", {"config": config, "seeds": [0], "metrics": {"trap_visits": [float("nan")]}}
+    file.write_text(json.dumps({"results": 2, "cells": {"x": nan}}))
+    with pytest.raises(InvalidValueError, match="without NaN"):
+        migrate(file)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["p.json", "s.sqlite"]
 
 
 def test_what_is_no_old_store_is_refused(tmp_path):

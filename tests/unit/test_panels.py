@@ -326,3 +326,9 @@ def test_names():
     assert as_panel(mine) is mine
     assert str(mine) == "1 rater: noise 0.1, bias 1"
     assert str(MAIN).startswith("3 raters: noise 0.1; noise 0.1, 0 on contested steps, temptation 0.6; ")
+
+
+@pytest.mark.parametrize("ends", [{"low": float("nan")}, {"low": "x"}, {"high": float("nan")}])
+def test_an_end_of_the_range_alone_is_checked_too(ends):
+    with pytest.raises(InvalidValueError, match=f"^{next(iter(ends))} = "):
+        Panel((Rater(),), **ends)

@@ -34,7 +34,7 @@ class Ceiling(Mitigation):
 
     def __post_init__(self) -> None:
         """Check the parameter."""
-        if not self.slack >= 0:
+        if not (isinstance(self.slack, int | float) and self.slack >= 0):
             raise InvalidValueError("slack", self.slack, "a number >= 0")
 
     def signal(self, evidence: Any, statistics: Any) -> LearningSignal:

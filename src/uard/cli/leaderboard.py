@@ -33,4 +33,4 @@ class Leaderboard:
             allowed = "a file that is there; `uard reproduce` and `uard run --store` make one"
             raise InvalidValueError("store", self.store, allowed)
         files.prepare(self.out, "out")
-        terminal.say(console, f"leaderboard: {leaderboard.write(Path(self.out), Store(self.store))}")
+        terminal.say(console, f"leaderboard: {leaderboard.write(Path(self.out), Store(self.store, readonly=True))}")

@@ -1,7 +1,7 @@
 """The environments of the laboratory by name.
 
 The command line, studies and Gymnasium's ids (``uard.envs.gym``) are made of this one table: an environment that stands
-here has all of them.
+here has all of them (CartPole and Acrobot have Gymnasium's own ids).
 """
 
 from __future__ import annotations

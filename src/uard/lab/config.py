@@ -1,7 +1,8 @@
 """Configurations as plain data, made of registered names and values, and the keys that are made of them.
 
 A class has a name and no address, so that moving it to another module loses no result. Ours have their own names; those
-of other packages stand behind the name of their package, and can so never be mistaken for ours:
+that entry points of other packages name stand behind the name of their package, and can so never be mistaken for ours.
+A class that nobody has registered stands behind its module:
 
     >>> type_name(dict), type_name(LookupError)
     ('builtins/dict', 'builtins/LookupError')
@@ -17,22 +18,38 @@ from typing import Any
 
 import numpy as np
 
-from uard import _checks
+from uard import _checks, plugins
 
 FORMAT = 3  # of configurations and keys; results with keys of an older one are brought over by ``uard migrate``
 TYPE = "type"  # beside a configuration's fields, the name of its class
 
 
 def type_name(cls: type) -> str:
-    """Return the name of a class in configurations: its own if it is uard's, else ``package/Class``.
+    """Return the name of a class in configurations.
+
+    Its own if it is uard's; ``package/Class`` if an entry point of its package names it, so that it may move; else
+    ``module/Class``, for a package may have two classes of that name.
 
     Examples:
         >>> from uard.lab.cell import Cell
         >>> type_name(Cell), type_name(json.JSONDecoder)
-        ('Cell', 'json/JSONDecoder')
+        ('Cell', 'json.decoder/JSONDecoder')
     """
     package = cls.__module__.partition(".")[0]
-    return cls.__qualname__ if package == "uard" else f"{package}/{cls.__qualname__}"
+    if package == "uard":
+        return cls.__qualname__
+    return f"{package if _is_registered(cls, package) else cls.__module__}/{cls.__qualname__}"
+
+
+def _is_registered(cls: type, package: str) -> bool:
+    for plugin in (p for kind in plugins.NAMED for p in plugins.found(kind)):
+        if plugin.entry.attr == cls.__qualname__ and plugin.entry.module.partition(".")[0] == package:
+            try:
+                if plugin.get() is cls:
+                    return True
+            except plugins.PluginError:  # a broken one is told where it is asked for
+                continue
+    return False
 
 
 def plain(value: Any) -> Any:

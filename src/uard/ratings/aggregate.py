@@ -42,8 +42,12 @@ def aggregate(
         Arrays (...); where nobody rated all numbers but ``proxy`` are 0.
 
     Raises:
-        InvalidValueError: a rating is infinite, shapes do not fit, or there is no column.
+        InvalidValueError: a rating is infinite, shapes do not fit, there is no column, the mask is not of truth values,
+            or something is no array.
     """
+    for name, array in (("ratings", ratings), ("proxy", proxy), ("mask", mask)):
+        if array is not None and not hasattr(array, "ndim"):
+            raise _checks.InvalidValueError(name, array, "an array of NumPy, JAX or torch")
     if ratings.ndim == 0 or ratings.shape[-1] == 0 or tuple(ratings.shape[:-1]) != tuple(proxy.shape):
         allowed = f"({', '.join([*map(str, proxy.shape), 'K'])}): one row per reward and one column per rater"
         raise _checks.InvalidValueError("ratings.shape", tuple(ratings.shape), allowed)
@@ -53,6 +57,8 @@ def aggregate(
             ratings = xp.astype(ratings, xp.asarray(0.0).dtype)
     if mask is not None:
         _checks.same_shape("mask", mask, "ratings", ratings)
+        if not namespace(mask).isdtype(mask.dtype, "bool"):
+            raise _checks.InvalidValueError("mask.dtype", mask.dtype, "truth values: True where a rating exists")
     elif not _checks.is_traced(ratings):
         finite = namespace(ratings).isfinite(ratings)
         if not finite.all():

@@ -177,12 +177,14 @@ class Panel:
             raise _checks.InvalidValueError("raters", self.raters, A_PANEL)
         for k, rater in enumerate(self.raters):
             _checks.instance(f"raters[{k}]", rater, Rater, "a Rater")
-        if self.low is None or self.high is None:
-            if any(rater.lapse > 0 or rater.stars is not None for rater in self.raters):
-                allowed = "given with high: raters who lapse or count in stars answer within a range"
-                raise _checks.InvalidValueError("low", self.low, allowed)
-        else:
-            _checks.number("low", self.low)
+        ranged = any(rater.lapse > 0 or rater.stars is not None for rater in self.raters)
+        if ranged and (self.low is None or self.high is None):
+            allowed = "given with high: raters who lapse or count in stars answer within a range"
+            raise _checks.InvalidValueError("low", self.low, allowed)
+        for name in ("low", "high"):
+            if getattr(self, name) is not None:
+                _checks.number(name, getattr(self, name))
+        if self.low is not None and self.high is not None:
             _checks.number("high", self.high, low=self.low, open_low=True)
 
     def __str__(self) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 
 from uard import _checks
 from uard.agents.base import Agent
-from uard.lab.config import TYPE, key_of
+from uard.lab.config import TYPE, key_of, type_name
 
 NUMBER = 2
 
@@ -55,6 +55,10 @@ _NAMES = {
 }  # fmt: skip
 _FIELDS = {("Cell", "feedback"): "rating_model"}
 _GONE = {("Locomotion", "spikes")}  # fields that can only be left out
+_CELL = {
+    *(TYPE, "environment", "mitigation", "agent", "panel", "noise", "rated", "episodes", "rating_model", "ddof"),
+    *("snapshots", "steps", "query"),
+}  # fields of a cell
 _LEFT_OUT: dict[str, dict[str, Any]] = {
     "Cell": {"rating_model": None, "steps": None, "query": "random"},
     "Network": {"activation": "relu"},
@@ -105,8 +109,12 @@ def new_config(old: dict[str, Any]) -> dict[str, Any]:
     Raises:
         UnmappedError: it has none.
     """
-    config = _new_value(old)
-    if config[TYPE] != "Cell" or old.get("panel") not in _PANELS:
+    try:
+        config = _new_value(old)
+        known = config[TYPE] == "Cell" and config.keys() == _CELL and old["panel"] in _PANELS
+    except (TypeError, KeyError, AttributeError, RecursionError):  # it is no configuration at all
+        config, known = {}, False
+    if not known:
         raise UnmappedError(f"no cell of format {NUMBER} looked like that: {_checks.short(old)}")
     return config | {"panel": _PANELS[old["panel"]]}
 
@@ -121,6 +129,8 @@ def new_key(config: dict[str, Any], old: dict[str, Any]) -> str:
     Raises:
         UnmappedError: nobody knows how it was trained.
     """
+    if not all(isinstance(config[part], dict) for part in ("agent", "environment")):
+        raise UnmappedError(f"no cell of format {NUMBER} looked like that: {_checks.short(old)}")
     family = _FAMILIES.get(config["agent"][TYPE]) or _family_of(old["agent"]["class"])
     trainer = _TRAINERS.get((family, config["steps"] is not None))
     if trainer is None:
@@ -147,7 +157,13 @@ def _new_name(path: str) -> str:
         raise UnmappedError(f"uard had no class {path} that a result was of")
     if "<locals>" in path:
         raise UnmappedError(f"the class {path} is local to a function")
-    return _NAMES[path] if package == "uard" else f"{package}/{path.rpartition('.')[2]}"
+    if package == "uard":
+        return _NAMES[path]
+    module, _, name = path.rpartition(".")
+    try:
+        return type_name(getattr(importlib.import_module(module), name))
+    except (ImportError, AttributeError, ValueError):  # the package is not installed here
+        return f"{module}/{name}"
 
 
 def _family_of(path: str) -> str:

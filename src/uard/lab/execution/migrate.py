@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import sqlite3
+import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -81,7 +82,7 @@ def migrate(path: str | Path) -> Migration:
         InvalidValueError: there is no such file, or nothing in it to migrate.
         StoreError: the store is damaged, cannot be written, is in use, or is of another format than the last.
     """
-    path = Path(path)
+    path = Path(path).resolve()  # the file itself, not a link to it
     if not path.is_file():
         raise _checks.InvalidValueError("path", str(path), "a result store, or a JSON file of published results")
     backup = path.with_name(f"{path.name}.format-{format_2.NUMBER}")
@@ -91,7 +92,7 @@ def migrate(path: str | Path) -> Migration:
 class _Keys:
     """New keys and configurations by old keys, and why there is none."""
 
-    def __init__(self, configs: dict[str, dict[str, Any]]):
+    def __init__(self, configs: dict[str, Any]):
         self.new: dict[str, tuple[str, dict[str, Any]]] = {}
         self.why: dict[str, str] = {}
         for key, old in configs.items():
@@ -111,28 +112,42 @@ def _migrate_published(path: Path, backup: Path) -> Migration:
         data = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise _checks.InvalidValueError("path", str(path), f"JSON ({error})") from None
-    if not isinstance(data, dict) or "cells" not in data or data.get("results") != format_2.NUMBER:
+    if not isinstance(data, dict) or not isinstance(data.get("cells"), dict) or data.get("results") != format_2.NUMBER:
         allowed = f"published results of format {format_2.NUMBER} (what `uard reproduce --extract` wrote)"
         raise _checks.InvalidValueError("path", str(path), allowed)
-    keys, rows, left, cells = _Keys({k: c["config"] for k, c in data["cells"].items()}), Counter[str](), Counter(), {}
-    for key, cell in data["cells"].items():
+    whole = {k: c for k, c in data["cells"].items() if _is_cell(c)}
+    keys, rows, left, cells = _Keys({k: c["config"] for k, c in whole.items()}), Counter[str](), Counter[str](), {}
+    left["they are no cell with config, seeds and metrics"] += len(data["cells"]) - len(whole)
+    for key, cell in whole.items():
         if key not in keys.new:
             left[keys.reason(key)] += len(cell["seeds"])
             continue
         new, config = keys.new[key]
+        if new in cells:
+            left["another cell of the same configuration was there"] += len(cell["seeds"])
+            continue
         cells[new] = {**cell, "config": config, "metrics": _renamed(cell["metrics"], format_2.METRICS)}
         if "curves" in cell:
             cells[new]["curves"] = _renamed(cell["curves"], format_2.COLUMNS)
         rows["results"] += len(cell["seeds"])
     _check_free(path, backup)
     head = {"format" if k == "results" else k: FORMAT if k == "results" else v for k, v in data.items()}
+    try:
+        text = json.dumps(head | {"cells": cells}, allow_nan=False) + "\n"
+    except ValueError:
+        raise _checks.InvalidValueError("path", str(path), "published results without NaN and infinity") from None
     shutil.copy2(path, backup)
-    files.write(path, json.dumps(head | {"cells": cells}, allow_nan=False) + "\n", "path")
-    return Migration(path, backup, len(cells), rows, left)
+    files.write(path, text, "path")
+    return Migration(path, backup, len(cells), rows, +left)
+
+
+def _is_cell(cell: Any) -> bool:
+    parts = {"config": dict, "seeds": list, "metrics": dict}
+    return isinstance(cell, dict) and all(isinstance(cell.get(name), kind) for name, kind in parts.items())
 
 
 def _check_free(path: Path, backup: Path) -> None:
-    if backup.exists():
+    if os.path.lexists(backup):
         raise _checks.InvalidValueError("path", str(path), f"one whose backup is not there yet; move {backup} away")
 
 
@@ -141,8 +156,13 @@ def _renamed(values: dict[str, Any], names: dict[str, str]) -> dict[str, Any]:
 
 
 def _migrate_store(path: Path, backup: Path) -> Migration:
-    fresh = path.with_name(f"{path.name}.migrating")
-    fresh.unlink(missing_ok=True)
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f"{path.name}.", suffix=".migrating")
+    except OSError as error:
+        raise StoreError(f"store = {str(path)!r}: could not be migrated ({error}); nothing was changed") from None
+    os.close(handle)
+    fresh = Path(name)
+    fresh.chmod(path.stat().st_mode & 0o777)
     try:
         with _alone(path) as source, closing(sqlite3.connect(fresh)) as target:
             _check_free(path, backup)
@@ -196,7 +216,7 @@ def _keep(path: Path, backup: Path) -> None:
 def _copied(source: sqlite3.Connection, target: sqlite3.Connection) -> tuple[int, Counter[str], Counter[str]]:
     """Copy all rows with new keys; return how many cells and rows there are, and why which were left out."""
     there = {row[0] for row in source.execute("select name from sqlite_master where type = 'table'")}
-    keys = _Keys({key: json.loads(text) for key, text in source.execute("select key, config from cells")})
+    keys = _Keys({key: _parsed(text) for key, text in source.execute("select key, config from cells")})
     rows, left = Counter[str](), Counter[str]()
     with target:
         for new, config in keys.new.values():
@@ -220,11 +240,19 @@ def _copied(source: sqlite3.Connection, target: sqlite3.Connection) -> tuple[int
     return rows.pop("cells", 0), rows, +left
 
 
+def _parsed(text: Any) -> Any:
+    try:
+        return json.loads(text)
+    except (TypeError, ValueError, RecursionError):
+        return text  # which is no configuration, and is told so
+
+
 def _checked(table: str, row: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Return a row with new names of metrics, and its table: a result that is not sound goes into quarantine."""
     if table != "results":
         return table, row
-    if digest(row["data"] + row["metrics"].encode()) != row["checksum"]:
+    sound = isinstance(row["data"], bytes) and isinstance(row["metrics"], str)
+    if not sound or digest(row["data"] + row["metrics"].encode()) != row["checksum"]:
         kept = {k: row[k] for k in ("key", "seed", "data", "created")}
         return "quarantine", kept | {"reason": "checksum does not match"}
     if format_2.METRICS:
