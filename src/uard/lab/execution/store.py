@@ -173,7 +173,7 @@ class Store:
         except sqlite3.DatabaseError as error:
             raise StoreError(
                 f"store = {self.path!r}: must be a result store, but {error}. Nothing was changed. Move the file aside "
-                "and start again, or name another with --store"
+                "and start again, or take another store"
             ) from None
 
     def _prepare(self, readonly: bool) -> None:
