@@ -30,7 +30,7 @@ class UnknownNameError(InvalidValueError):
         names = sorted(known)
         near = difflib.get_close_matches(str(value).lower(), names, n=1, cutoff=0.5)
         hint = f" (did you mean {near[0]!r}?)" if near else ""
-        super().__init__(field, value, f"one of {', '.join(names)}{hint}")
+        super().__init__(field, value, f"one of {', '.join(names)}{hint}" if names else "left out: there is none")
 
 
 def short(value: object) -> str:

@@ -188,7 +188,7 @@ def test_a_file_that_is_no_sound_store_is_named_and_left_alone(tmp_path, make):
         Store(path)
     message = str(caught.value)
     assert message.startswith(f"store = {str(path)!r}: must be a result store, but ")
-    assert message.endswith("Move the file aside and start again, or name another with --store")
+    assert message.endswith("Move the file aside and start again, or take another store")
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["s.sqlite"]
 
