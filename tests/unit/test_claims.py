@@ -1,4 +1,5 @@
 import os
+import secrets
 import signal
 import sqlite3
 import subprocess
@@ -7,12 +8,13 @@ import time
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from uard.lab.cell import Cell
-from uard.lab.execution import runner
+from uard.lab.execution import claims, runner
 from uard.lab.execution.claims import LEASE, Owner
 from uard.lab.execution.store import Store, StoreError, record_heartbeat
 from uard.lab.execution.training import attempt
@@ -75,11 +77,51 @@ def test_one_that_has_stopped_is_dead_though_its_process_lives(owner):
     assert not owner.alive(beat=time.time()) or not owner.place
 
 
-def test_elsewhere_the_last_heartbeat_decides(owner):
-    far = replace(owner, place="another kernel")
-    for other in (far, replace(owner, place="")):
-        assert other.alive(beat=1000, now=1000 + LEASE - 1)
-        assert not other.alive(beat=1000, now=1000 + LEASE)
+class Clocks:
+    """The date and the steady clock of this machine; the first can be set."""
+
+    def __init__(self, monkeypatch):
+        self.date, self.steady = 1.8e9, 500.0
+        monkeypatch.setattr(claims, "time", SimpleNamespace(time=lambda: self.date, monotonic=lambda: self.steady))
+
+    def wait(self, seconds):
+        self.date += seconds
+        self.steady += seconds
+
+
+@pytest.mark.parametrize("place", ["another kernel", ""])
+@pytest.mark.parametrize("ahead", [-LEASE + 1, 0, 3600, 86400, 1e9])
+def test_elsewhere_one_is_dead_when_its_heartbeat_has_not_changed_whatever_its_clock_said(monkeypatch, place, ahead):
+    clocks, far = Clocks(monkeypatch), Owner(secrets.token_hex(), "far", place, 1, 1)
+    beat = clocks.date + ahead
+    assert far.alive(beat)
+    clocks.wait(LEASE - 1 if ahead >= 0 else 0)
+    assert far.alive(beat)
+    clocks.wait(1)
+    assert not far.alive(beat)
+    assert far.alive(beat + 15), "it was only slow"
+    clocks.wait(LEASE - 1)
+    assert far.alive(beat + 15), "whose heart beats, however far its clock is behind"
+    clocks.wait(1)
+    assert not far.alive(beat + 15)
+
+
+@pytest.mark.parametrize("jump", [-86400, 86400])
+def test_setting_this_clock_while_one_elsewhere_works_neither_ends_nor_revives_it(monkeypatch, jump):
+    clocks, far = Clocks(monkeypatch), Owner(secrets.token_hex(), "far", "another kernel", 1, 1)
+    start = clocks.date
+    for i in range(3):
+        assert far.alive(start + 15 * i)
+        clocks.wait(15)
+    clocks.date += jump
+    assert far.alive(start + 30)
+    clocks.wait(LEASE)
+    assert not far.alive(start + 30)
+
+
+def test_one_elsewhere_whose_last_heartbeat_is_old_is_dead_at_once(monkeypatch):
+    clocks, far = Clocks(monkeypatch), Owner(secrets.token_hex(), "far", "another kernel", 1, 1)
+    assert not far.alive(clocks.date - LEASE)
 
 
 def test_what_is_claimed_is_claimed_once(store, path, owner):

@@ -223,4 +223,14 @@ def test_false_alarms_are_as_rare_as_they_should_be():
 
 
 def test_resamples_are_shared_by_equal_sizes():
-    assert statistics._resampled(10) is statistics._resampled(10)
+    assert next(statistics._resampled(10)) is next(statistics._resampled(10))
+
+
+def test_many_seeds_are_resampled_in_blocks_to_the_same_numbers(monkeypatch):
+    values = np.random.default_rng(3).normal(size=(3, 301))
+    whole = [(summarise(v), *statistics.intervals(v[None])) for v in values]
+    monkeypatch.setattr(statistics, "_AT_ONCE", 301 * 7)
+    for v, (summary, interval) in zip(values, whole, strict=True):
+        assert summarise(v) == summary
+        np.testing.assert_allclose(statistics.intervals(v[None])[0], interval, rtol=1e-12)
+        np.testing.assert_allclose(interval, summary.ci95, rtol=1e-9)

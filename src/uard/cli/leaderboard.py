@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,9 +29,14 @@ class Leaderboard:
         """Read the store and write the page."""
         from uard.lab.execution.store import Store
         from uard.lab.views import leaderboard
+        from uard.lab.views.status import said_of_damaged
 
         if not Path(self.store).is_file():
             allowed = "a file that is there; `uard reproduce` and `uard run --store` make one"
             raise InvalidValueError("store", self.store, allowed)
         files.prepare(self.out, "out")
-        terminal.say(console, f"leaderboard: {leaderboard.write(Path(self.out), Store(self.store, readonly=True))}")
+        with closing(Store(self.store, readonly=True)) as store:
+            written = leaderboard.write(Path(self.out), store)
+            for line in said_of_damaged(store.damaged):
+                terminal.warning(console, line)
+        terminal.say(console, f"leaderboard: {written}")

@@ -55,7 +55,7 @@ class Status:
 
         out = terminal.output()
         terminal.say(out, f"{self.store}: {found.cells} cells, {found.seeds} seeds")
-        for line in status.lines(found.runs):
+        for line in (*status.said_of_damaged(found.damaged), *status.lines(found.runs)):
             terminal.say(out, line)
         columns = ("study", "seeds a cell", "finished", "in work", "failed", "missing", "last finished (UTC)")
         rows = []

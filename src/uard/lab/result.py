@@ -119,24 +119,40 @@ class Result:
         return data, digest(data)
 
     @staticmethod
-    def unpack(data: bytes, checksum: str) -> Result:
+    def unpack(data: bytes, checksum: str | None = None) -> Result:
         """Read what ``pack`` wrote.
 
+        Args:
+            data: The bytes.
+            checksum: Theirs; left out if whoever kept them has checked it.
+
         Raises:
-            CorruptResultError: the bytes do not have that checksum, or hold NaN.
+            CorruptResultError: the bytes do not have that checksum, are no packed result, or hold NaN.
         """
-        if digest(data) != checksum:
+        if checksum is not None and digest(data) != checksum:
             raise CorruptResultError("checksum does not match")
-        header, _, body = zlib.decompress(data).partition(b"\n")
-        named, offset = {}, 0
-        for name, dtype, shape in json.loads(header):
-            count = math.prod(shape)
-            named[name] = np.frombuffer(body, dtype, count, offset).reshape(shape)
-            offset += named[name].nbytes
-        log, steps, path = named.pop("log"), int(named.pop("steps")), named.pop("path")
+        try:
+            arrays = _arrays(data)
+            log, steps, path = arrays.pop("log"), int(arrays.pop("steps")), arrays.pop("path")
+        except (zlib.error, ValueError, TypeError, KeyError, RecursionError, MemoryError, OverflowError) as error:
+            raise CorruptResultError(f"it is no packed result ({type(error).__name__}: {error})") from None
+        if log.ndim != 2 or log.shape[1] != len(LOG) or not len(log) or log.dtype.kind not in "fiu" or steps < 0:
+            raise CorruptResultError(f"the log has shape {log.shape}, {steps} steps: must be (episodes, {len(LOG)})")
         if not np.isfinite(log).all():
             raise CorruptResultError("the log holds NaN or infinity")
-        return Result(log, steps, path, named)
+        return Result(log, steps, path, arrays)
+
+
+def _arrays(data: bytes) -> dict[str, np.ndarray]:
+    header, _, body = zlib.decompress(data).partition(b"\n")
+    named, offset = {}, 0
+    for name, dtype, shape in json.loads(header):
+        count = math.prod(shape)
+        named[name] = np.frombuffer(body, dtype, count, offset).reshape(shape)
+        offset += named[name].nbytes
+    if offset != len(body):
+        raise ValueError(f"{len(body)} bytes instead of {offset}")
+    return named
 
 
 def summaries(results: list[Result]) -> dict[str, statistics.Summary]:

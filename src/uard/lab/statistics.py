@@ -6,8 +6,8 @@ Needs SciPy (the ``lab`` extra) for the tests only. Bootstrap intervals are seed
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import cache
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -55,8 +55,21 @@ class Test(NamedTuple):
     effect: float
 
 
-@cache
-def _resampled(n: int) -> np.ndarray:
+_AT_ONCE = 4_000_000  # numbers that are drawn at once: 32 MB
+
+
+def _resampled(n: int) -> Iterator[np.ndarray]:
+    """Yield which of n values each resample is made of: ``RESAMPLES`` rows in all, in blocks for a large n."""
+    if RESAMPLES * n <= _AT_ONCE:
+        yield _resampled_whole(n)
+        return
+    generator, rows = np.random.default_rng(20260101), max(1, _AT_ONCE // n)
+    for first in range(0, RESAMPLES, rows):
+        yield generator.integers(0, n, (min(rows, RESAMPLES - first), n))
+
+
+@lru_cache(maxsize=16)
+def _resampled_whole(n: int) -> np.ndarray:
     return np.random.default_rng(20260101).integers(0, n, (RESAMPLES, n))
 
 
@@ -98,9 +111,10 @@ def summarise(values: Sequence[float] | np.ndarray, field: str = "values") -> Su
         InvalidValueError: no values, or one that is not finite.
     """
     x = _sample(field, values, least=1)
-    drawn = x[_resampled(x.size)]
-    low, high = np.quantile(drawn.mean(1), [0.025, 0.975])
-    iqm_low, iqm_high = np.quantile(interquartile_mean(drawn), [0.025, 0.975])
+    drawn = [(sample.mean(1), interquartile_mean(sample)) for sample in (x[rows] for rows in _resampled(x.size))]
+    means, middles = (np.concatenate(several) for several in zip(*drawn, strict=True))
+    low, high = np.quantile(means, [0.025, 0.975])
+    iqm_low, iqm_high = np.quantile(middles, [0.025, 0.975])
     return Summary(
         float(x.mean()),
         float(x.std(ddof=1)) if x.size > 1 else 0.0,
@@ -124,11 +138,19 @@ def intervals(values: np.ndarray) -> np.ndarray:
     Returns:
         (m, 2) lower and upper ends.
     """
-    drawn = _resampled(values.shape[1])
-    counts = np.stack([(drawn == i).sum(1) for i in range(values.shape[1])])
-    blocks = np.array_split(values, -(-len(values) // 1000))  # of 16 MB
-    means = (block @ counts / values.shape[1] for block in blocks)
-    return np.concatenate([np.quantile(m, [0.025, 0.975], axis=1).T for m in means])
+    n = values.shape[1]
+    counts = [_counts(drawn, n) for drawn in _resampled(n)] if RESAMPLES * n <= _AT_ONCE else None
+    found = []
+    for block in np.array_split(values, -(-len(values) // 1000)):  # whose means are 16 MB
+        means = [block @ count / n for count in counts or (_counts(drawn, n) for drawn in _resampled(n))]
+        found.append(np.quantile(np.concatenate(means, 1), [0.025, 0.975], axis=1).T)
+    return np.concatenate(found)
+
+
+def _counts(drawn: np.ndarray, n: int) -> np.ndarray:
+    """Return how often each of n values is in each resample, (n, resamples)."""
+    places = drawn + n * np.arange(len(drawn))[:, None]
+    return np.bincount(places.ravel(), minlength=n * len(drawn)).reshape(-1, n).T.astype(float)
 
 
 def _sample(field: str, values: object, least: int = 2) -> np.ndarray:

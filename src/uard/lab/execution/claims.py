@@ -8,11 +8,23 @@ import socket
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 HEARTBEAT = 15.0  # seconds between two heartbeats
 LEASE = 120.0  # seconds without one, after which a process that cannot be looked up counts as dead
 
 _at_work: set[str] = set()  # tokens of owners in this process
+
+
+class _Seen(NamedTuple):
+    """A heartbeat of an owner elsewhere; since when, by this machine's steady clock; whether it was another before."""
+
+    beat: float
+    since: float
+    changed: bool
+
+
+_seen: dict[str, _Seen] = {}  # by token, the last heartbeat of every owner that this process has looked at
 
 
 @dataclass(frozen=True)
@@ -46,18 +58,24 @@ class Owner:
         """Count as dead from now on, for this process at least."""
         _at_work.discard(self.token)
 
-    def alive(self, beat: float, now: float | None = None) -> bool:
-        """Whether it still runs: exactly if it is of this machine (Linux), by its last heartbeat elsewhere.
+    def alive(self, beat: float) -> bool:
+        """Whether it still runs: exactly if it is of this machine (Linux), by its heartbeats elsewhere.
+
+        Clocks of two machines may differ by any amount, and each may be set at any time. So one elsewhere that has been
+        seen to change its heartbeat is alive until it has not done so for ``LEASE`` seconds of this machine's steady
+        clock. One that has not is dead then, too, and at once if its heartbeat is older than that by the date.
 
         Args:
-            beat: When that was, in seconds since 1970.
-            now: The time; that of this machine's clock if left out.
+            beat: Its last heartbeat, in seconds since 1970 by its own clock.
         """
         if self.place and self.place == _place():
             if self.pid == os.getpid() and _born(self.pid) == self.born:
                 return self.token in _at_work
             return _born(self.pid) == self.born
-        return (time.time() if now is None else now) - beat < LEASE
+        now, before = time.monotonic(), _seen.get(self.token)
+        if before is None or before.beat != beat:
+            before = _seen[self.token] = _Seen(beat, now, changed=before is not None)
+        return now - before.since < LEASE and (before.changed or time.time() - beat < LEASE)
 
     def __str__(self) -> str:
         """Return host and process id."""

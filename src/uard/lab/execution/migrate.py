@@ -10,6 +10,7 @@ import os
 import shutil
 import sqlite3
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -21,10 +22,11 @@ from uard import _checks
 from uard._support import files
 from uard.lab.config import FORMAT
 from uard.lab.execution import format_2
-from uard.lab.execution.claims import Owner
+from uard.lab.execution.claims import LEASE, Owner
 from uard.lab.execution.format_2 import UnmappedError
-from uard.lab.execution.store import TABLES, StoreError, check_store, create_tables
-from uard.lab.result import digest
+from uard.lab.execution.rows import check_failure, check_run, checksum_of, finished_seed
+from uard.lab.execution.store import TABLES, StoreError, check_store, create_tables, text_of
+from uard.lab.result import CorruptResultError, digest
 
 
 @dataclass(frozen=True)
@@ -188,13 +190,17 @@ def _alone(path: Path) -> Iterator[sqlite3.Connection]:
         sqlite3.Error: it is in use, or damaged.
     """
     with closing(sqlite3.connect(path, timeout=5)) as db:
+        db.text_factory = text_of
         if db.execute("pragma user_version").fetchone()[0] == FORMAT:
+            check_store(db, str(path))  # one that is damaged is not well
             raise StoreError(f"store = {str(path)!r}: is of format {FORMAT} already; there is nothing to migrate")
         tables = check_store(db, str(path), format_2.NUMBER)
         if "runs" in tables:
-            living = "select token, host, place, pid, born, beat from runs where ended is null"
+            living = """select token, host, place, pid, born, beat from runs
+                where ended is null and typeof(beat) in ('real', 'integer')"""
             for *owner, beat in db.execute(living):
-                if Owner(*owner).alive(beat):
+                # A heartbeat from the future is of another clock, and says nothing; the lock below still does.
+                if Owner(*owner).alive(beat) and beat < time.time() + LEASE:
                     raise StoreError(
                         f"store = {str(path)!r}: {Owner(*owner)} is at work on it; wait for it, or stop it"
                     )
@@ -231,7 +237,11 @@ def _copied(source: sqlite3.Connection, target: sqlite3.Connection) -> tuple[int
                     continue
                 if "key" in row:
                     row["key"] = keys.new[row["key"]][0]
-                place, row = _checked(table, row)
+                try:
+                    place, row = _checked(table, row)
+                except _checks.InvalidValueError as error:
+                    left[f"they are damaged ({table}: {error})"] += 1
+                    continue
                 marks = ", ".join("?" * len(row))
                 put = f"insert or ignore into {place} ({', '.join(row)}) values ({marks})"
                 added = target.execute(put, tuple(row.values())).rowcount
@@ -248,14 +258,28 @@ def _parsed(text: Any) -> Any:
 
 
 def _checked(table: str, row: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return a row with new names of metrics, and its table: a result that is not sound goes into quarantine."""
+    """Return a row with new names of metrics, and its table: a result that is not sound goes into quarantine.
+
+    Raises:
+        InvalidValueError: a row of another table that is damaged.
+    """
+    if check := {"runs": check_run, "failures": check_failure}.get(table):
+        check(*row.values())
     if table != "results":
         return table, row
-    sound = isinstance(row["data"], bytes) and isinstance(row["metrics"], str)
-    if not sound or digest(row["data"] + row["metrics"].encode()) != row["checksum"]:
+    try:
+        return table, _renamed_result(row)
+    except (CorruptResultError, _checks.InvalidValueError) as error:
         kept = {k: row[k] for k in ("key", "seed", "data", "created")}
-        return "quarantine", kept | {"reason": "checksum does not match"}
-    if format_2.METRICS:
-        metrics = json.dumps(_renamed(json.loads(row["metrics"]), format_2.METRICS))
-        row |= {"metrics": metrics, "checksum": digest(row["data"] + metrics.encode())}
-    return table, row
+        return "quarantine", kept | {"reason": str(error)}
+
+
+def _renamed_result(row: dict[str, Any]) -> dict[str, Any]:
+    data, text = row["data"], row["metrics"]
+    if not (isinstance(data, bytes) and isinstance(text, str) and digest(data + text.encode()) == row["checksum"]):
+        raise CorruptResultError("checksum does not match")
+    old = _parsed(text)
+    metrics = json.dumps(_renamed(old, format_2.METRICS) if isinstance(old, dict) else old)
+    new = row | {"metrics": metrics, "checksum": checksum_of(row["key"], row["seed"], data, metrics)}
+    finished_seed(0, *new.values())
+    return new

@@ -233,11 +233,11 @@ class _Elsewhere(NamedTuple):
 
 def _sort_out(jobs: list[Job], store: Store, known: dict[tuple[str, int], FailedSeed]) -> _Elsewhere:
     """Return what became of jobs; ``known`` are failures of earlier runs, which do not count."""
-    finished, failures, claimed = store.finished(), store.failures(), store.claimed()
+    finished, failures, claimed = store.places(), store.failures(), store.claimed()
     held, free, failed = [], [], {}
     for cell, seed in jobs:
         place = cell.key, seed
-        if seed in finished.get(cell.key, ()):
+        if place in finished:
             continue
         if place in failures and failures[place] != known.get(place):
             failed[cell, seed] = failures[place].traceback

@@ -9,18 +9,22 @@ import json
 import sqlite3
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import Any
-from urllib.parse import quote
+from typing import Any, TypeVar
 
-from uard import __version__
+from uard import InvalidValueError, __version__, _checks
 from uard.lab.cell import Cell
 from uard.lab.config import FORMAT
+from uard.lab.execution import rows
 from uard.lab.execution.claims import Owner
-from uard.lab.result import CorruptResultError, Result, digest
+from uard.lab.execution.reading import can_be_written, open_for_reading
+from uard.lab.execution.rows import DamagedSeed, FinishedSeed
+from uard.lab.result import CorruptResultError, Result
+
+T = TypeVar("T")
 
 # The file's ``user_version`` is the format of its keys; what is of an older one goes through ``uard migrate``.
 TABLES = {
@@ -137,8 +141,12 @@ class Store:
         >>> store.missing(cell, range(3)), store.metrics(cell, [0])[0]["hacks"]
         ([1, 2], 1.0)
 
+    Whatever is read is checked (``uard.lab.execution.rows``). A damaged seed counts as not there: ``have``, ``missing``
+    and ``get`` move it to the table ``quarantine``, so that it is trained again; others name it in ``damaged``.
+
     Attributes:
         path: The file; ``:memory:`` keeps nothing.
+        readonly: Whether it is only read.
     """
 
     def __init__(self, path: str | Path, readonly: bool = False):
@@ -146,7 +154,7 @@ class Store:
 
         Args:
             path: The file.
-            readonly: Only read: the file must be there, and is not changed.
+            readonly: Only read: the file must be there, and is not changed. So is a file that is in a read-only place.
 
         Raises:
             StoreError: the folder cannot be written, or the file is no sound result store, or is not there.
@@ -154,45 +162,56 @@ class Store:
         self.path = str(path)
         if readonly and not Path(self.path).is_file():
             raise StoreError(f"store = {self.path!r}: must be a result store, but there is no such file")
+        self.readonly = readonly or (Path(self.path).is_file() and not can_be_written(self.path))
+        self._damaged_rows: dict[int, DamagedSeed] = {}  # by rowid
+        self._damaged_cells: dict[str, DamagedSeed] = {}
+        self._leaving = ExitStack()
+        able = "read" if self.readonly else "written"
         try:
-            if readonly:
-                self._db = sqlite3.connect(f"file:{quote(self.path)}?mode=ro", timeout=60, uri=True)
-            else:
-                if self.path != ":memory:":
-                    Path(self.path).parent.mkdir(parents=True, exist_ok=True)
-                self._db = sqlite3.connect(self.path, timeout=60)
-            try:
-                self._prepare(readonly)
-            except BaseException:
-                self._db.close()
-                raise
+            with ExitStack() as leaving:
+                self._db = self._open(leaving)
+                self._leaving = leaving.pop_all()
         except OSError as error:
-            raise StoreError(f"store = {self.path!r}: must be in a folder that can be written ({error})") from None
+            raise StoreError(f"store = {self.path!r}: must be in a folder that can be {able} ({error})") from None
         except sqlite3.OperationalError as error:
-            raise StoreError(f"store = {self.path!r}: must be a file that can be written ({error})") from None
+            raise StoreError(f"store = {self.path!r}: must be a file that can be {able} ({error})") from None
         except sqlite3.DatabaseError as error:
             raise StoreError(
                 f"store = {self.path!r}: must be a result store, but {error}. Nothing was changed. Move the file aside "
                 "and start again, or take another store"
             ) from None
 
-    def _prepare(self, readonly: bool) -> None:
-        tables = check_store(self._db, self.path)
-        if readonly and not tables:
+    def _open(self, leaving: ExitStack) -> sqlite3.Connection:
+        if self.readonly:
+            db = open_for_reading(self.path, leaving)
+        else:
+            if self.path != ":memory:":
+                Path(self.path).parent.mkdir(parents=True, exist_ok=True)
+            db = leaving.enter_context(closing(sqlite3.connect(self.path, timeout=60)))
+        db.text_factory = text_of
+        tables = check_store(db, self.path)
+        if not self.readonly:
+            db.execute("pragma journal_mode=wal")
+            db.execute("pragma synchronous=normal")
+            create_tables(db)
+        elif not tables:
             raise sqlite3.DatabaseError("it is empty")
-        if readonly:
-            return
-        self._db.execute("pragma journal_mode=wal")
-        self._db.execute("pragma synchronous=normal")
-        create_tables(self._db)
+        return db
 
     def close(self) -> None:
         """Close the file."""
-        self._db.close()
+        self._leaving.close()
+
+    @property
+    def damaged(self) -> tuple[DamagedSeed, ...]:
+        """What was damaged of all that has been read so far, was left out, and is not in quarantine."""
+        return (*self._damaged_rows.values(), *self._damaged_cells.values())
 
     def have(self, cell: Cell) -> set[int]:
-        """Return the seeds that are finished; a corrupt one is quarantined as by ``get``."""
-        return {seed for seed, _ in self._sound(cell)}
+        """Return the seeds that are finished; a damaged one is quarantined as by ``get``."""
+        found = {row.seed for row in self._sound(cell.key)}
+        self._quarantine()
+        return found
 
     def missing(self, cell: Cell, seeds: Iterable[int]) -> list[int]:
         """Return those of the seeds that are not finished."""
@@ -212,14 +231,15 @@ class Store:
                 self._describe(cell)
                 self._db.execute(
                     "insert or ignore into results values (?, ?, ?, ?, ?, ?, ?)",
-                    (key, seed, data, digest(data + metrics.encode()), metrics, __version__, now),
+                    (key, seed, data, rows.checksum_of(key, seed, data, metrics), metrics, __version__, now),
                 )
                 for table in ("claims", "failures"):
                     self._db.execute(f"delete from {table} where key = ? and seed = ?", (key, seed))
 
     def _describe(self, cell: Cell) -> None:
         config = json.dumps(cell.config(), sort_keys=True)
-        self._db.execute("insert or ignore into cells values (?, ?)", (cell.key, config))
+        put = "insert into cells values (?, ?) on conflict (key) do update set config = ? where config is not ?"
+        self._db.execute(put, (cell.key, config, config, config))
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -233,88 +253,115 @@ class Store:
                 f"store = {self.path!r}: cannot be written ({error}); what was finished before is safe"
             ) from None
 
+    def _read(self, query: str, *values: Any) -> Iterator[tuple[Any, ...]]:
+        """Yield what a query finds."""
+        try:
+            yield from self._db.execute(query, values)
+        except sqlite3.Error as error:
+            raise StoreError(f"store = {self.path!r}: cannot be read ({error})") from None
+
+    def _sound(self, key: str | None = None) -> Iterator[FinishedSeed]:
+        """Yield the finished seeds of a cell, or of all, that are what was written; the others are then ``damaged``."""
+        query, values = f"select {rows.FINISHED} from results", ()
+        if key is not None:
+            query, values = f"{query} where key = ?", (key,)
+        for row in self._read(query, *values):
+            try:
+                found = rows.finished_seed(*row)
+            except (CorruptResultError, InvalidValueError) as error:
+                self._damaged_rows[row[0]] = DamagedSeed.of(row[1], row[2], str(error))
+            else:
+                yield found
+
     def get(self, cell: Cell, seeds: Iterable[int]) -> dict[int, Result]:
         """Return the finished ones of the seeds.
 
-        A corrupt one is moved to the table ``quarantine`` and left out, so that it is trained again.
+        A damaged one is moved to the table ``quarantine`` and left out, so that it is trained again; where nothing can
+        be written it is only left out.
         """
         wanted = set(seeds)
         found: dict[int, Result] = {}
-        for seed, data in self._sound(cell):
-            if seed not in wanted:
+        for row in self._sound(cell.key):
+            if row.seed not in wanted:
                 continue
             try:
-                found[seed] = Result.unpack(data, digest(data))
-            except (CorruptResultError, ValueError, KeyError, OSError) as error:
-                self._quarantine(cell.key, seed, data, str(error))
+                found[row.seed] = Result.unpack(row.data)
+            except CorruptResultError as error:
+                self._damaged_rows[row.rowid] = DamagedSeed.of(row.key, row.seed, str(error))
+        self._quarantine()
         return found
 
     def metrics(self, cell: Cell, seeds: Iterable[int]) -> dict[int, dict[str, float]]:
-        """Return the metrics of the finished ones of the seeds, without reading their curves.
-
-        They are as sound as they were when ``have`` last checked them.
-        """
+        """Return the metrics of the finished ones of the seeds, without unpacking their curves."""
         wanted = set(seeds)
-        rows = self._db.execute("select seed, metrics from results where key = ?", (cell.key,))
-        return {seed: json.loads(text) for seed, text in rows if seed in wanted}
+        return {row.seed: row.metrics for row in self._sound(cell.key) if row.seed in wanted}
 
-    def _sound(self, cell: Cell) -> list[tuple[int, bytes]]:
-        """Return seed and bytes of every result whose checksum matches, and quarantine the others."""
-        query = "select seed, data, metrics, checksum from results where key = ?"
-        sound = []
-        for seed, data, metrics, checksum in self._db.execute(query, (cell.key,)).fetchall():
-            if digest(data + metrics.encode()) == checksum:
-                sound.append((seed, data))
+    def stored(self, key: str) -> tuple[dict[int, tuple[bytes, dict[str, float]]], list[DamagedSeed]]:
+        """Return bytes and metrics of a cell's seeds, and which of them are damaged; nothing is changed."""
+        sound: dict[int, tuple[bytes, dict[str, float]]] = {}
+        for row in self._sound(key):
+            try:
+                Result.unpack(row.data)
+            except CorruptResultError as error:
+                self._damaged_rows[row.rowid] = DamagedSeed.of(row.key, row.seed, str(error))
             else:
-                self._quarantine(cell.key, seed, data, "checksum does not match")
-        return sound
+                sound[row.seed] = row.data, row.metrics
+        return sound, [damaged for damaged in self.damaged if damaged.key == key]
 
-    def stored(self, key: str) -> tuple[dict[int, tuple[bytes, dict[str, float]]], list[int]]:
-        """Return bytes and metrics of a cell's seeds, and which seeds are corrupt; nothing is changed."""
-        query = "select seed, data, metrics, checksum from results where key = ?"
-        sound, corrupt = {}, []
-        for seed, data, metrics, checksum in self._db.execute(query, (key,)):
-            if digest(data + metrics.encode()) == checksum:
-                sound[seed] = data, json.loads(metrics)
-            else:
-                corrupt.append(seed)
-        return sound, corrupt
-
-    def configs(self) -> dict[str, str]:
-        """Return the configuration, as JSON, of every cell that has a finished seed, by key."""
+    def configs(self) -> dict[str, dict[str, Any]]:
+        """Return the configuration of every cell that has a finished seed, by key; a damaged one is left out."""
         query = "select key, config from cells where exists (select 1 from results where results.key = cells.key)"
-        return dict(self._db.execute(query).fetchall())
+        return self._configs(query)
+
+    def _configs(self, query: str) -> dict[str, dict[str, Any]]:
+        found = {}
+        for key, text in self._read(query):
+            if (config := rows.config_of(key, text)) is None:
+                self._damaged_cells[key] = DamagedSeed.of(key, None, "its configuration is not what its key is of")
+            else:
+                found[key] = config
+        return found
 
     def versions(self) -> tuple[str, ...]:
         """Return the versions of the program that trained what is here."""
-        return tuple(row[0] for row in self._db.execute("select distinct version from results order by version"))
+        query = "select distinct version from results order by version"
+        return tuple(version for (version,) in self._read(query) if isinstance(version, str))
 
-    def _quarantine(self, key: str, seed: int, data: bytes, reason: str) -> None:
-        with self._db:
-            self._db.execute("insert into quarantine values (?, ?, ?, ?, ?)", (key, seed, data, reason, time.time()))
-            self._db.execute("delete from results where key = ? and seed = ? and data = ?", (key, seed, data))
+    def _quarantine(self) -> None:
+        """Move what was found damaged to the table of that name, where anything can be written."""
+        if self.readonly or not self._damaged_rows:
+            return
+        with self._writing():
+            for rowid in self._damaged_rows:
+                for row in self._read(f"select {rows.FINISHED} from results where rowid = ?", rowid):
+                    try:  # again, for another process may have put a sound one there
+                        Result.unpack(rows.finished_seed(*row).data)
+                    except (CorruptResultError, InvalidValueError) as error:
+                        put = "insert into quarantine select key, seed, data, ?, ? from results where rowid = ?"
+                        self._db.execute(put, (str(error), time.time(), rowid))
+                        self._db.execute("delete from results where rowid = ?", (rowid,))
+        self._damaged_rows.clear()
 
     def quarantined(self) -> list[tuple[str, int, str]]:
         """Return (key, seed, reason) of every result that was found corrupt."""
-        return [tuple(row) for row in self._db.execute("select key, seed, reason from quarantine")]
+        return [tuple(row) for row in self._read("select key, seed, reason from quarantine")]
 
     def cells(self) -> list[Stored]:
-        """Return all cells, whatever program wrote them; they are as sound as ``have`` last found them."""
+        """Return all cells, whatever program wrote them, with their sound seeds in order."""
         metrics: dict[str, dict[int, dict[str, float]]] = defaultdict(dict)
-        for key, seed, text in self._db.execute("select key, seed, metrics from results order by seed"):
-            metrics[key][seed] = json.loads(text)
+        for row in self._sound():
+            metrics[row.key][row.seed] = row.metrics
         failed = Counter(key for key, _ in self.failures())
-        configs = dict(self._db.execute("select key, config from cells"))
         return [
-            Stored(json.loads(config), metrics[key], failed[key])
-            for key, config in configs.items()
+            Stored(config, dict(sorted(metrics[key].items())), failed[key])
+            for key, config in self._configs("select key, config from cells").items()
             if key in metrics or key in failed
         ]
 
     def count(self) -> tuple[int, int]:
         """Return the numbers of cells and of finished seeds."""
-        row = self._db.execute("select count(distinct key), count(*) from results").fetchone()
-        return int(row[0]), int(row[1])
+        ((cells, seeds),) = self._read("select count(distinct key), count(*) from results")
+        return int(cells), int(seeds)
 
     def begin(self, owner: Owner, total: int) -> None:
         """Write down that a process goes to work on ``total`` missing seeds; claims of processes that have died end."""
@@ -382,32 +429,52 @@ class Store:
                 (select count(*) from claims where claims.token = runs.token)
             from runs where ended is null or ended = (select max(ended) from runs) order by began
         """
-        return [WorkerRun(Owner(*row[:5]), *row[5:]) for row in self._db.execute(query)]
+        return [WorkerRun(self._checked("runs", rows.check_run, row[:12]), *row[5:]) for row in self._read(query)]
+
+    def _checked(self, table: str, check: Callable[..., T], row: Sequence[Any]) -> T:
+        try:
+            return check(*row)
+        except InvalidValueError as error:
+            where = f"store = {self.path!r}, table {table}, row {_checks.short(tuple(row[:2]))}"
+            raise StoreError(f"{where}: {error}; delete that row, or take another store") from None
 
     def claimed(self) -> dict[tuple[str, int], WorkerRun]:
         """Return who is training each (key, seed); claims of processes that have died are left out."""
         living = {run.owner.token: run for run in self.runs() if run.alive}
-        rows = self._db.execute("select key, seed, token from claims").fetchall()
-        return {(key, seed): living[token] for key, seed, token in rows if token in living}
+        claims = self._read("select key, seed, token from claims")
+        return {(key, seed): living[token] for key, seed, token in claims if token in living}
 
     def attempts(self) -> dict[tuple[str, int], list[str]]:
         """Return the tokens of those who began to train each (key, seed), in order."""
         found: dict[tuple[str, int], list[str]] = {}
-        for key, seed, token in self._db.execute("select key, seed, token from attempts order by rowid"):
+        for key, seed, token in self._read("select key, seed, token from attempts order by rowid"):
             found.setdefault((key, seed), []).append(token)
         return found
 
     def failures(self) -> dict[tuple[str, int], FailedSeed]:
         """Return what failed when it was last tried, by (key, seed)."""
         query = "select key, seed, error, traceback, version, token, created from failures"
-        return {(row[0], row[1]): FailedSeed(*row[2:]) for row in self._db.execute(query)}
+        found = {}
+        for row in self._read(query):
+            self._checked("failures", rows.check_failure, row)
+            found[row[0], row[1]] = FailedSeed(*row[2:])
+        return found
 
     def finished(self) -> dict[str, dict[int, float]]:
-        """Return when each seed was finished, in seconds since 1970, by key; their bytes are not read."""
+        """Return when each sound seed was finished, in seconds since 1970, by key."""
         found: dict[str, dict[int, float]] = {}
-        for key, seed, created in self._db.execute("select key, seed, created from results"):
-            found.setdefault(key, {})[seed] = created
+        for row in self._sound():
+            found.setdefault(row.key, {})[row.seed] = row.created
         return found
+
+    def places(self) -> set[tuple[str, int]]:
+        """Return (key, seed) of all finished seeds, at once: their bytes are not read, and not checked."""
+        return {(key, seed) for key, seed in self._read("select key, seed from results")}
+
+
+def text_of(raw: bytes) -> str:
+    """Decode any text: what is no UTF-8 must not end the reading of all other rows."""
+    return raw.decode(errors="backslashreplace")
 
 
 def check_store(db: sqlite3.Connection, path: str, version: int = FORMAT) -> set[str]:

@@ -21,7 +21,7 @@ import numpy as np
 from uard import _checks
 from uard.lab.config import TYPE
 from uard.lab.execution.store import Store
-from uard.lab.result import Result, digest
+from uard.lab.result import Result
 from uard.lab.statistics import hedges_g
 from uard.lab.views.leaderboard import panel_name
 
@@ -82,7 +82,7 @@ class Comparison:
         everywhere: Per metric, the mean over all differing cells of the difference in standard deviations.
         only_a: Configurations of which only A has results, by key.
         only_b: The same of B.
-        damaged: Results left out because their checksum does not match: (store, key, seed).
+        damaged: Results left out because they are not what was written: (store, key, seed), seed None for a whole cell.
         versions: Of the program, of A's results and B's.
         least_p: The smallest p that so few seeds can give; above ``LEVEL``, nothing can be found.
     """
@@ -91,7 +91,7 @@ class Comparison:
     everywhere: tuple[Effect, ...]
     only_a: dict[str, dict[str, Any]]
     only_b: dict[str, dict[str, Any]]
-    damaged: tuple[tuple[str, str, int], ...]
+    damaged: tuple[tuple[str, str, int | str | None], ...]
     versions: tuple[tuple[str, ...], tuple[str, ...]]
     least_p: float
 
@@ -113,15 +113,15 @@ def compare(a: Store, b: Store) -> Comparison:
         InvalidValueError: they have no seed of any cell in common.
     """
     configs_a, configs_b = a.configs(), b.configs()
-    keys_b = {text: key for key, text in configs_b.items()}
+    keys_b = {_canonical(config): key for key, config in configs_b.items()}
     cells, pairs, damaged, shared = [], [], [], set()
-    for key, text in configs_a.items():
-        if text not in keys_b:
+    for key, config in configs_a.items():
+        if (text := _canonical(config)) not in keys_b:
             continue
         found = []
         for store, k in ((a, key), (b, keys_b[text])):
             sound, bad = store.stored(k)
-            damaged += [(store.path, k, seed) for seed in bad]
+            damaged += [(store.path, k, lost.seed) for lost in bad]
             found.append(sound)
         seeds = sorted(found[0].keys() & found[1].keys())
         if not seeds:
@@ -129,21 +129,26 @@ def compare(a: Store, b: Store) -> Comparison:
         shared.add(text)
         same = tuple(s for s in seeds if _same(found[0][s][0], found[1][s][0]))
         parts = sorted({p for s in seeds if s not in same for p in _parts(found[0][s][0], found[1][s][0])})
-        cells.append(CellComparison(key, json.loads(text), tuple(seeds), same, tuple(parts), ()))
+        cells.append(CellComparison(key, config, tuple(seeds), same, tuple(parts), ()))
         if parts:
             pairs.append((len(cells) - 1, seeds, [[found[i][s][1] for s in seeds] for i in (0, 1)]))
+    damaged += [(store.path, lost.key, None) for store in (a, b) for lost in store.damaged if lost.seed is None]
     if not cells:
         raise _checks.InvalidValueError("store", b.path, f"one that has a seed of a cell in common with {a.path!r}")
     per_cell, everywhere, least = _tested(pairs)
     return Comparison(
         cells=tuple(replace(cell, effects=per_cell.get(i, ())) for i, cell in enumerate(cells)),
         everywhere=everywhere,
-        only_a={key: json.loads(text) for key, text in configs_a.items() if text not in shared},
-        only_b={key: json.loads(text) for key, text in configs_b.items() if text not in shared},
+        only_a={key: c for key, c in configs_a.items() if _canonical(c) not in shared},
+        only_b={key: c for key, c in configs_b.items() if _canonical(c) not in shared},
         damaged=tuple(damaged),
         versions=(a.versions(), b.versions()),
         least_p=least,
     )
+
+
+def _canonical(config: dict[str, Any]) -> str:
+    return json.dumps(config, sort_keys=True)
 
 
 def _same(one: bytes, other: bytes) -> bool:
@@ -152,7 +157,7 @@ def _same(one: bytes, other: bytes) -> bool:
 
 
 def _parts(one: bytes, other: bytes) -> set[str]:
-    x, y = (Result.unpack(data, digest(data)) for data in (one, other))
+    x, y = (Result.unpack(data) for data in (one, other))
     mine, theirs = ({"log": r.log, "path": r.path, "steps": np.int64(r.steps), **r.extra} for r in (x, y))
     return {
         name
@@ -276,7 +281,7 @@ def lines(comparison: Comparison) -> list[str]:
             some = [title(config) for config in list(only.values())[:3]]
             found.append(f"only in {name}: {len(only)} cells, such as {'; '.join(some)}")
     if comparison.damaged:
-        found.append(f"left out, for their checksums do not match: {len(comparison.damaged)} results")
+        found.append(f"left out, for they are damaged: {len(comparison.damaged)} results")
     versions = " and ".join("/".join(v) or "none" for v in comparison.versions)
     verdict = "differ" if comparison.differs else "identical" if comparison.identical else "equal within seed noise"
     return [*found, f"versions: {versions}", f"verdict: {verdict}"]

@@ -199,6 +199,7 @@ def write(target: Path, store: Store) -> Path:
         },
         seeds=sum(x.seeds for x in these),
         cells=len(these),
+        damaged=len(store.damaged),
     )
     files.write(target, page, "out")
     return target

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from uard.lab.execution.claims import HEARTBEAT
+from uard.lab.execution.rows import DamagedSeed
 from uard.lab.execution.store import FailedSeed, Store, WorkerRun
 from uard.lab.study import Study
 
@@ -61,6 +63,7 @@ class Status:
         runs: Processes at work, those that died, and the last that ended.
         studies: Those asked for; those of which the store knows anything if none were.
         failures: Of these studies.
+        damaged: Results that are not what was written; they count as missing, and are trained again.
     """
 
     cells: int
@@ -68,6 +71,7 @@ class Status:
     runs: tuple[WorkerRun, ...]
     studies: tuple[StudyStatus, ...]
     failures: tuple[FailedCell, ...]
+    damaged: tuple[DamagedSeed, ...]
 
 
 def titles(studies: Iterable[Study]) -> dict[str, str]:
@@ -94,7 +98,8 @@ def status(store: Store, studies: Sequence[Study], seeds: int | None = None, eve
     wrong: dict[str, set[int]] = {}
     for keys, found in ((claimed, busy), (failed, wrong)):
         for key, seed in keys:
-            found.setdefault(key, set()).add(seed)
+            if isinstance(seed, int):  # a claim may be damaged, too
+                found.setdefault(key, set()).add(seed)
     lines = []
     for study in studies:
         keys = list(dict.fromkeys(r.cell.key for r in study.rows))
@@ -105,9 +110,9 @@ def status(store: Store, studies: Sequence[Study], seeds: int | None = None, eve
         done = [t for key in keys for seed, t in finished.get(key, {}).items() if seed < wanted]
         at_work, lost = 0, 0
         for key in keys:
-            open_ = {s for s in range(wanted)} - finished.get(key, {}).keys()
-            at_work += len(open_ & busy.get(key, set()))
-            lost += len((open_ & wrong.get(key, set())) - busy.get(key, set()))
+            working = {s for s in busy.get(key, set()) - finished.get(key, {}).keys() if s < wanted}
+            at_work += len(working)
+            lost += len({s for s in wrong.get(key, set()) - finished.get(key, {}).keys() if s < wanted} - working)
         missing = len(keys) * wanted - len(done) - at_work - lost
         last = max(done, default=None)
         lines.append(StudyStatus(study.name, wanted, len(done), at_work, lost, missing, last))
@@ -120,7 +125,8 @@ def status(store: Store, studies: Sequence[Study], seeds: int | None = None, eve
         FailedCell(names[key], tuple(sorted(which)), failed[key, which[0]]) for (key, _), which in alike.items()
     )
     cells = len(finished)
-    return Status(cells, sum(map(len, finished.values())), tuple(store.runs()), tuple(lines), failures)
+    seeds_done = sum(map(len, finished.values()))
+    return Status(cells, seeds_done, tuple(store.runs()), tuple(lines), failures, store.damaged)
 
 
 def duration(seconds: float) -> str:
@@ -151,7 +157,9 @@ def lines(runs: Iterable[WorkerRun], now: float | None = None) -> list[str]:
         if run.done and stop > run.began:
             parts.append(f"{60 * run.done / (stop - run.began):.3g} seeds/min")
         if run.alive and run.remaining is not None:
-            parts.append(f"about {duration(max(0.0, run.remaining - (now - run.beat)))} left")
+            parts.append(f"about {duration(max(0.0, run.remaining - max(0.0, now - run.beat)))} left")
+        if run.alive and run.beat - now > HEARTBEAT:
+            parts.append(f"perhaps: its last heartbeat is {duration(run.beat - now)} ahead of this machine's clock")
         if not run.alive:
             parts.append(f"last heartbeat {clock(stop)}")
         found.append("; ".join(parts))
@@ -162,3 +170,12 @@ def as_data(found: Status) -> dict[str, Any]:
     """Return it as plain data; times are seconds since 1970."""
     runs = [{**asdict(run), "alive": run.alive} for run in found.runs]
     return {**asdict(found), "runs": runs}
+
+
+def said_of_damaged(damaged: Sequence[DamagedSeed], most: int = 3) -> list[str]:
+    """Return in lines what of a store is damaged; the first ``most`` by name."""
+    named = [f"cell {d.key}{'' if d.seed is None else f', seed {d.seed}'}: {d.reason}" for d in damaged[:most]]
+    if not damaged:
+        return []
+    head = f"{len(damaged)} damaged, left out (`uard reproduce` trains damaged seeds again); such as"
+    return [head, *(f"  {line}" for line in named)]
