@@ -358,7 +358,7 @@ def test_sections_of_packages_join_the_report(broken, tmp_path):
     assert section.losses == ("Nobody has tried uard on bells of 1000.",)
     why = {error.plugin.name: str(error) for error in bad}
     assert "AttributeError" in why["gone"]
-    assert "KeyError: 'no such study'" in why["late"]
+    assert "study = 'no such study': must be one of" in why["late"]
     assert "the name 'made' of its section or file is taken" in why["made"]
 
 

@@ -6,11 +6,13 @@ import hashlib
 import json
 import math
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from uard import _checks
 from uard.lab import statistics
 from uard.training.episode_log import LOG
 
@@ -26,6 +28,9 @@ METRICS = (
     "abstained",
 )
 
+
+COLUMNS = (*LOG, "alignment_gap")  # that ``Result.curve`` knows
+_FORMERLY = {"trap_visits": "hacks", "goal": "success", "goal_rate": "success_rate"}
 
 # Columns of what a result has in ``extra`` under "calibration", "rating_error" and "tables".
 CALIBRATION = ("auroc_sigma_h", "auroc_with_proxy", "spearman_sigma_h", "spearman_with_proxy")
@@ -53,6 +58,25 @@ class DivergedError(FloatingPointError):
     def __reduce__(self) -> tuple[Any, ...]:
         """Travel between processes whole."""
         return type(self), (str(self), self.name, self.good)
+
+
+def check_name(field: str, name: str, known: Iterable[str]) -> str:
+    """Return the name of a metric or a column if it is ``known``.
+
+    Examples:
+        >>> check_name("column", "trap_visits", COLUMNS)
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: column = 'trap_visits': must be 'hacks', as it is called now
+
+    Raises:
+        UnknownNameError: it is not.
+        InvalidValueError: it is not, but was up to version 0.1; with what it is called now.
+    """
+    known = tuple(known)
+    if name not in known and _FORMERLY.get(name) in known:
+        raise _checks.InvalidValueError(field, name, f"{_FORMERLY[name]!r}, as it is called now")
+    return _checks.choose(field, name, known)
 
 
 def digest(data: bytes) -> str:
@@ -104,8 +128,9 @@ class Result:
         """Return one column of the log, (episodes,); ``alignment_gap`` is |observed - true|.
 
         Raises:
-            ValueError: there is no such column.
+            UnknownNameError: there is no such column.
         """
+        check_name("column", name, COLUMNS)
         if name == "alignment_gap":
             return np.abs(self.curve("observed_return") - self.curve("true_return"))
         return self.log[:, LOG.index(name)].astype(float)

@@ -149,8 +149,10 @@ def intervals(values: np.ndarray) -> np.ndarray:
 
 def _counts(drawn: np.ndarray, n: int) -> np.ndarray:
     """Return how often each of n values is in each resample, (n, resamples)."""
-    places = drawn + n * np.arange(len(drawn))[:, None]
-    return np.bincount(places.ravel(), minlength=n * len(drawn)).reshape(-1, n).T.astype(float)
+    counts = np.empty((len(drawn), n))
+    for count, row in zip(counts, drawn, strict=True):
+        count[:] = np.bincount(row, minlength=n)
+    return counts.T
 
 
 def _sample(field: str, values: object, least: int = 2) -> np.ndarray:

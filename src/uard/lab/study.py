@@ -15,9 +15,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from uard import _checks
 from uard.lab.cell import Cell
-from uard.lab.execution.store import Store
-from uard.lab.result import Result
+from uard.lab.execution.store import MissingSeedsError, Store
+from uard.lab.result import COLUMNS, Result, check_name
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,15 @@ class Study:
     curves: tuple[str, ...] = ()
     derive: Callable[[Cell, Mapping[int, Result]], dict[str, Any]] | None = None
 
+    def __post_init__(self) -> None:
+        """Check the curves.
+
+        Raises:
+            UnknownNameError: a curve that is no column of the episode log.
+        """
+        for i, name in enumerate(self.curves):
+            check_name(f"curves[{i}]", name, COLUMNS)
+
     def jobs(self, seeds: Iterable[int]) -> list[tuple[Cell, int]]:
         """Return every (cell, seed), the seeds of a cell side by side so that it finishes as a whole."""
         seeds = list(seeds)
@@ -96,10 +106,14 @@ class Study:
         """Return the only row with these labels.
 
         Raises:
-            ValueError: there is none, or several.
+            InvalidValueError: there is none, or several.
         """
-        (found,) = self.where(**labels)
-        return found
+        found = list(self.where(**labels))
+        if len(found) != 1:
+            known = {name: None for r in self.rows for name, _ in r.labels}
+            allowed = f"those of exactly one row of the study {self.name!r}, not of {len(found)}; labels are"
+            raise _checks.InvalidValueError("labels", labels, f"{allowed} {', '.join(known)}")
+        return found[0]
 
 
 def results_of(cell: Cell, store: Store, seeds: Iterable[int]) -> list[Result]:
@@ -110,7 +124,7 @@ def results_of(cell: Cell, store: Store, seeds: Iterable[int]) -> list[Result]:
         [(500, 6), (500, 6)]
 
     Raises:
-        LookupError: some are not in the store.
+        MissingSeedsError: some are not in the store.
     """
     seeds = list(seeds)
     return _all(store.get(cell, seeds), seeds, cell, store)
@@ -124,7 +138,7 @@ def metrics_of(cell: Cell, store: Store, seeds: Iterable[int]) -> list[dict[str,
         [1.0, 1.0]
 
     Raises:
-        LookupError: some are not in the store.
+        MissingSeedsError: some are not in the store.
     """
     seeds = list(seeds)
     return _all(store.metrics(cell, seeds), seeds, cell, store)
@@ -133,5 +147,5 @@ def metrics_of(cell: Cell, store: Store, seeds: Iterable[int]) -> list[dict[str,
 def _all(found: dict[int, Any], seeds: list[int], cell: Cell, store: Store) -> list[Any]:
     lost = [s for s in seeds if s not in found]
     if lost:
-        raise LookupError(f"seeds {lost} of this cell are not in the store {store.path!r}; run it again: {cell}")
+        raise MissingSeedsError(f"seeds {lost} of this cell are not in the store {store.path!r}; run it again: {cell}")
     return [found[s] for s in seeds]

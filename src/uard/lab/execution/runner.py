@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from uard._support import files
 from uard.lab.cell import Cell
 from uard.lab.execution.batching import Job, batches, shape_of
 from uard.lab.execution.claims import HEARTBEAT, Owner
@@ -281,7 +282,7 @@ def _kept(answer: Result | DivergedError | str, store: Store) -> Result | str:
     file = folder / f"{answer.name}.npz"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with file.open("wb") as stream:
+        with files.replacing(file) as stream:
             np.savez(stream, **answer.good)  # type: ignore[arg-type]
     except OSError as error:
         return f"{answer}; its last good state could not be written to {file} ({error})"

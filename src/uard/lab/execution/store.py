@@ -59,6 +59,10 @@ class StoreError(RuntimeError):
     """The result store cannot be used; the message names the file and says what to do."""
 
 
+class MissingSeedsError(StoreError, LookupError):
+    """Seeds that are not in a store, or are damaged there; the message says which."""
+
+
 @dataclass(frozen=True)
 class Stored:
     """What a store says of one cell, without its curves.

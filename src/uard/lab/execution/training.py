@@ -5,9 +5,11 @@ from __future__ import annotations
 import pickle
 import traceback
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+from uard._checks import InvalidValueError, number
 from uard.lab.execution.batching import Job
 from uard.lab.result import DivergedError, Result
 
@@ -35,7 +37,7 @@ def attempt(batch: Sequence[Job], folder: Path | None) -> Answer:
     """
     finishers = _guarded(lambda: batch[0][0].trainer.train(batch, folder))
     if isinstance(finishers, list):
-        return [_guarded(finish) for finish in finishers]
+        return [_guarded(partial(_finished, finish)) for finish in finishers]
     cells = dict.fromkeys(cell for cell, _ in batch)
     if len(cells) < 2:
         return str(finishers)
@@ -51,7 +53,9 @@ def packed(batch: list[Job], folder: Path | None) -> bytes | None:
     """Pickle a batch for ``attempt_packed``; None if it cannot be: its class is local to a function, say."""
     try:
         return pickle.dumps((batch, folder))
-    except Exception:
+    except KeyboardInterrupt:
+        raise
+    except BaseException:
         return None
 
 
@@ -61,10 +65,22 @@ def attempt_packed(data: bytes) -> Answer:
     return attempt(*unpacked) if isinstance(unpacked, tuple) else str(unpacked)
 
 
+def _finished(finish: Callable[[], Result]) -> Result:
+    """Return a result that a store takes: one whose metrics are numbers."""
+    result = finish()
+    if not len(result.log):
+        raise InvalidValueError("episodes or steps", 0, "enough for one episode to end")
+    for name, value in result.metrics().items():
+        number(f"the metric {name}", value)
+    return result
+
+
 def _guarded(action: Callable[[], T]) -> T | DivergedError | str:
     try:
         return action()
     except DivergedError as error:
         return error
-    except Exception:
+    except KeyboardInterrupt:  # of whoever stops the study
+        raise
+    except BaseException:  # SystemExit, too: what is trained may not end the study, as if all were well perhaps
         return traceback.format_exc()

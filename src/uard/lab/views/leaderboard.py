@@ -123,32 +123,38 @@ def lines(store: Store) -> list[Line]:
     cells = store.cells()
     known = _Names([cell.config for cell in cells])
     seeds = [cell.metrics for cell in cells]
-    hacks = _estimates([[m["hacks"] / m["episode_length"] for m in s.values()] for s in seeds])
-    true = _estimates([[m["true_return"] for m in s.values()] for s in seeds])
+    rates = [[m["hacks"] / m["episode_length"] for m in s.values()] for s in seeds]
+    both = _estimates(rates + [[m["true_return"] for m in s.values()] for s in seeds])
+    hacks, true = both[: len(cells)], both[len(cells) :]
     made = [_line(c.config, known, len(c.metrics), c.failed, h, t) for c, h, t in zip(cells, hacks, true, strict=True)]
     return sorted(made, key=lambda x: (*x.setting, -x.true.mean if x.true else np.inf, x.mitigation))
 
 
 def standings(these: Sequence[Line]) -> list[Standing]:
     """Sum the lines up by mitigation, the one that is unbeaten in most settings first."""
-    raw = {x.place: x for x in these if x.mitigation == RAW and x.compared}
-    rivals: dict[Any, list[Line]] = defaultdict(list)
+    raw: dict[Any, Any] = {x.place: x for x in these if x.mitigation == RAW and x.compared}
+    rivals: dict[Any, list[Any]] = defaultdict(list)
     of: dict[str, list[Line]] = defaultdict(list)
     for x in these:
         of[x.mitigation].append(x)
         if x.compared and x.mitigation != RAW:
             rivals[x.setting].append(x)
+    best = {setting: max(x.true.low for x in some) for setting, some in rivals.items()}
 
     def against_raw(some: Iterable[Line], better: Any) -> tuple[int, int]:
         pairs = [(x, raw[x.place]) for x in some if x.compared and x.mitigation != RAW and x.place in raw]
         return sum(better(x, r) for x, r in pairs), len(pairs)
 
-    def unbeaten(some: Iterable[Line]) -> tuple[int, int]:
-        fields = [
-            (x, [r for r in (*rivals[x.setting], raw.get(x.place)) if r and r is not x]) for x in some if x.compared
-        ]
-        fields = [(x, others) for x, others in fields if others]
-        return sum(not any(r.true.above(x.true) for r in others) for x, others in fields), len(fields)
+    def unbeaten(some: Iterable[Any]) -> tuple[int, int]:
+        won = []
+        for x in (x for x in some if x.compared):
+            base = raw.get(x.place)
+            others = len(rivals[x.setting]) - (x.mitigation != RAW) + (base is not None and base is not x)
+            if others:
+                # Its own low, which is among these, is never above its high.
+                highest = max(best.get(x.setting, -np.inf), base.true.low if base else -np.inf)
+                won.append(x.true.high >= highest)
+        return sum(won), len(won)
 
     out = []
     for mitigation, every in of.items():

@@ -33,7 +33,7 @@ from uard.lab import statistics
 from uard.lab.cell import Cell
 from uard.lab.config import FORMAT
 from uard.lab.execution.store import Store
-from uard.lab.result import Result
+from uard.lab.result import Result, check_name
 from uard.lab.statistics import Summary
 from uard.lab.study import Row, Study
 from uard.plugins import Plugin, PluginError, brought
@@ -144,7 +144,8 @@ def _binned(curve: np.ndarray) -> np.ndarray:
 class Published:
     """Published results of some studies.
 
-    Methods that take a row want one that was published (``has``), and raise KeyError for another.
+    Methods that take a row want one that was published (``has``), and raise LookupError for another; unknown names are
+    an InvalidValueError.
 
     Examples:
         >>> published = Published([study], [extract([study], store, seeds=[0, 1], command="made by hand")])
@@ -162,7 +163,7 @@ class Published:
         """Read what ``extract`` gave.
 
         Raises:
-            InvalidValueError: something of another format of keys.
+            InvalidValueError: something of another format of keys, or that is no published results.
         """
         self.studies = {s.name: s for s in studies}
         self.sources = [{k: v for k, v in f.items() if k != "cells"} for f in files]
@@ -170,6 +171,7 @@ class Published:
         for f in files:
             if _format_of(f) != FORMAT:
                 raise _checks.InvalidValueError("format", _format_of(f), f"{FORMAT}: {MIGRATE}")
+            check_cells(f)
             self._cells |= f["cells"]
 
     @property
@@ -183,11 +185,23 @@ class Published:
 
     def rows(self, study: str, **labels: Any) -> list[Row]:
         """Return the published rows of a study with these labels."""
-        return [r for r in self.studies[study].where(**labels) if self.has(r)]
+        return [r for r in self._study(study).where(**labels) if self.has(r)]
+
+    def _study(self, name: str) -> Study:
+        return self.studies[_checks.choose("study", name, self.studies)]
+
+    def _cell(self, row: Row) -> dict[str, Any]:
+        if not self.has(row):
+            raise LookupError(f"{dict(row.labels)} was not published; run its study and extract it again")
+        return self._cells[row.cell.key]
+
+    def _numbers(self, row: Row, part: str, name: str) -> np.ndarray:
+        found = self._cell(row).get(part, {})
+        return np.array(found[check_name(part, name, found)], float)
 
     def seeds_of(self, row: Row) -> tuple[int, ...]:
         """Return the seeds of a row."""
-        return tuple(self._cells[row.cell.key]["seeds"])
+        return tuple(self._cell(row)["seeds"])
 
     def seeds(self, study: str) -> int:
         """Return the smallest number of seeds of a published row."""
@@ -199,7 +213,7 @@ class Published:
 
     def per_seed(self, row: Row, metric: str) -> np.ndarray:
         """Return a metric, one number per seed."""
-        return np.array(self._cells[row.cell.key]["metrics"][metric], float)
+        return self._numbers(row, "metrics", metric)
 
     def get(self, study: str, metric: str, **labels: Any) -> Summary:
         """Return the summary of the only row of a study with these labels.
@@ -207,18 +221,48 @@ class Published:
         Raises:
             LookupError: it was not published.
         """
-        row = self.studies[study].one(**labels)
+        row = self._study(study).one(**labels)
         if not self.has(row):
             raise LookupError(f"{labels} of {study} was not published; run uard reproduce {study} and extract it again")
         return self.of(row, metric)
 
     def curves(self, row: Row, column: str) -> np.ndarray:
         """Return a curve in bins of ``BIN`` episodes, (seeds, bins)."""
-        return np.array(self._cells[row.cell.key]["curves"][column], float)
+        return self._numbers(row, "curves", column)
 
     def derived(self, row: Row, name: str) -> np.ndarray:
         """Return something derived, one entry per seed."""
-        return np.array(self._cells[row.cell.key]["derived"][name], float)
+        return self._numbers(row, "derived", name)
+
+
+def check_cells(data: Any) -> None:
+    """Check that data are what ``extract`` gives: finite metrics and curves, as many as there are seeds.
+
+    Examples:
+        >>> check_cells({"cells": {"a": {"config": {}, "seeds": [0], "metrics": {"hacks": [1.0, 2.0]}}}})
+        Traceback (most recent call last):
+            ...
+        uard._checks.InvalidValueError: cells[a].metrics.hacks.shape = (2,): must be one entry for each of 1 seeds
+
+    Raises:
+        InvalidValueError: naming the field.
+    """
+    cells = _checks.instance("cells", data.get("cells") if isinstance(data, dict) else data, dict, "cells by key")
+    for key, cell in cells.items():
+        kinds = (("config", dict, "an object"), ("seeds", list, "a list"), ("metrics", dict, "an object"))
+        for name, kind, allowed in kinds:
+            part = _checks.instance(f"cells[{key}]", cell, dict, "an object").get(name)
+            _checks.instance(f"cells[{key}].{name}", part, kind, allowed)
+        for part in ("metrics", "curves"):
+            curves = _checks.instance(f"cells[{key}].{part}", cell.get(part, {}), dict, "an object")
+            for name, values in curves.items():
+                field = f"cells[{key}].{part}.{name}"
+                shape = _checks.as_numpy(field, values).shape
+                _checks.finite(field, values)
+                if shape[:1] != (len(cell["seeds"]),) or len(shape) != (1 if part == "metrics" else 2):
+                    raise _checks.InvalidValueError(
+                        f"{field}.shape", shape, f"one entry for each of {len(cell['seeds'])} seeds"
+                    )
 
 
 def packaged_json(name: str) -> Any:
@@ -275,6 +319,10 @@ def _checked(plugin: Plugin) -> ResultFiles:
     """Return a package's files; those of studies must have keys of the present format."""
     made = _called(plugin)
     for name in made.studies:
+        try:
+            check_cells(_read(made, name))
+        except ValueError as error:  # of JSON, too
+            raise PluginError(plugin, f"{name} is no published results: {error}") from None
         if (found := _format_of(_read(made, name))) != FORMAT:
             raise PluginError(plugin, f"{name} is of format {found}, not {FORMAT}: {MIGRATE}")
     return made

@@ -7,17 +7,19 @@ from typing import Any
 
 import numpy as np
 
+from uard import _checks
 from uard.lab import statistics
 from uard.lab.cell import Cell
 from uard.lab.execution.store import Store
-from uard.lab.result import Result
+from uard.lab.result import METRICS, Result, check_name
 from uard.lab.study import Row, Study, metrics_of, results_of
 
 
 class StudyResults:
     """Finished studies over some seeds.
 
-    Seeds that are not in the store and unknown names of studies and metrics are a LookupError.
+    Seeds that are not in the store are a MissingSeedsError; unknown names of studies, metrics and columns, and labels
+    that name no row or several, are an InvalidValueError.
 
     Examples:
         >>> cell, store = Cell(episodes=20), Store(":memory:")
@@ -48,6 +50,7 @@ class StudyResults:
         """Return one metric, one number per seed."""
         if cell not in self._metrics:
             self._metrics[cell] = metrics_of(cell, self.store, self.seeds)
+        check_name("metric", metric, METRICS)
         return np.array([m[metric] for m in self._metrics[cell]])
 
     def of(self, cell: Cell, metric: str) -> statistics.Summary:
@@ -64,7 +67,7 @@ class StudyResults:
 
     def row(self, study: str, **labels: Any) -> Row:
         """Return the only row of a study with these labels."""
-        return self.studies[study].one(**labels)
+        return self.studies[_checks.choose("study", study, self.studies)].one(**labels)
 
     def get(self, study: str, metric: str, **labels: Any) -> statistics.Summary:
         """Return the summary of one row of a study."""
@@ -75,9 +78,23 @@ class StudyResults:
         return self.values(self.row(study, **labels).cell, metric)
 
     def curves(self, study: str, column: str, **labels: Any) -> np.ndarray:
-        """Return a per-episode column, (seeds, episodes)."""
-        return np.stack([r.curve(column) for r in self.results(self.row(study, **labels).cell)])
+        """Return a per-episode column, (seeds, episodes).
+
+        Raises:
+            InvalidValueError: seeds have different numbers of episodes.
+        """
+        curves = [r.curve(column) for r in self.results(self.row(study, **labels).cell)]
+        if len(lengths := {len(curve) for curve in curves}) > 1:
+            raise _checks.InvalidValueError("episodes", sorted(lengths), "as many of one seed as of another")
+        return np.stack(curves)
 
     def window(self, study: str, column: str, first: int, last: int, **labels: Any) -> statistics.Summary:
-        """Return a column's mean over episodes first..last (1-based, inclusive), summarised over seeds."""
-        return statistics.summarise(self.curves(study, column, **labels)[:, first - 1 : last].mean(1), column)
+        """Return a column's mean over episodes first..last (1-based, inclusive), summarised over seeds.
+
+        Raises:
+            InvalidValueError: there are no such episodes.
+        """
+        curves = self.curves(study, column, **labels)
+        _checks.whole("last", last, low=1, high=curves.shape[1])
+        _checks.whole("first", first, low=1, high=last)
+        return statistics.summarise(curves[:, first - 1 : last].mean(1), column)

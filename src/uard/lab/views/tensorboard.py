@@ -51,7 +51,7 @@ class Events:
         """Return the folder of a seed."""
         parts = (cell.environment, cell.mitigation, cell.agent)
         title = self._titles.get(cell.key) or " ".join(type(part).__name__ for part in parts)
-        name = re.sub(r"[^\w.+-]+", "_", title)[:120].strip("_")
+        name = re.sub(r"[^\w.+-]+", "_", title).encode()[:120].decode(errors="ignore").strip("_")  # 255 bytes fit
         return self.folder / f"{name}-{cell.key[:8]}" / f"seed-{seed}"
 
     def write(self, finished: Iterable[tuple[Cell, int, Result]]) -> None:
