@@ -224,3 +224,57 @@ def test_reading_makes_no_store(tmp_path):
     with pytest.raises(StoreError, match="it is empty"):
         Store(tmp_path / "empty", readonly=True)
     assert [p.name for p in tmp_path.iterdir()] == ["empty"]
+
+
+@pytest.mark.parametrize(
+    "stop", [SystemExit(0), SystemExit("no"), GeneratorExit(), type("Own", (BaseException,), {})()]
+)
+def test_what_is_trained_cannot_end_the_study_as_if_all_were_well(monkeypatch, store, stop):
+    def train(self, batch, folder):
+        def finish():
+            raise stop
+
+        if batch[0][0] == TWO:
+            raise stop
+        return [finish, *[result] * (len(batch) - 1)]
+
+    monkeypatch.setattr(Tabular, "train", train)
+    with pytest.raises(runner.StudyFailedError) as caught:
+        runner.run(JOBS, store, workers=1)
+    assert {job for failure in caught.value.failures for job in failure.jobs} == {(ONE, 0), (TWO, 0)}
+    assert store.have(ONE) == {1}
+    assert {why.error.partition(":")[0].rpartition(".")[2] for why in store.failures().values()} == {
+        type(stop).__name__
+    }
+
+
+def test_an_interrupt_still_ends_the_study(monkeypatch, store):
+    def train(self, batch, folder):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Tabular, "train", train)
+    with pytest.raises(KeyboardInterrupt):
+        runner.run(JOBS, store, workers=1)
+    assert store.failures() == {}
+
+
+@pytest.mark.parametrize("log", [np.zeros((0, 6)), np.full((3, 6), np.nan)])
+def test_a_result_without_numbers_is_a_failure_and_not_stored(monkeypatch, store, log):
+    monkeypatch.setattr(Tabular, "train", lambda self, batch, folder: [lambda: Result(log, 1, np.zeros(2), {})])
+    with pytest.raises(runner.StudyFailedError, match=r"enough for one episode|must be a finite number"):
+        runner.run(JOBS[:1], store, workers=1)
+    assert store.count() == (0, 0)
+
+
+def test_a_claim_of_a_dead_process_whose_clock_was_ahead_is_taken_over_by_one_that_waits(monkeypatch, store):
+    far = Owner("far", "other", "another boot", 1, 1)
+    store.begin(far, 1)
+    store.claim(JOBS[:1], far)
+    store._db.execute("update runs set beat = ?", (time.time() + 86400,))
+    store._db.commit()
+    monkeypatch.setattr(claims, "LEASE", 1.0)
+    monkeypatch.setattr(Tabular, "train", lambda self, batch, folder: [result] * len(batch))
+    began = time.monotonic()
+    assert runner.run(JOBS[:1], store, workers=1) == 1
+    assert 1.0 <= time.monotonic() - began < 10
+    assert store.attempts()[ONE.key, 0][0] == "far"

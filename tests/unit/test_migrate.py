@@ -42,7 +42,7 @@ from uard.lab.execution.claims import Owner
 from uard.lab.execution.format_2 import UnmappedError, new_config, new_key
 from uard.lab.execution.migrate import lines, migrate
 from uard.lab.execution.store import Store, StoreError
-from uard.lab.result import METRICS
+from uard.lab.result import METRICS, digest
 from uard.lab.trainers import TRAINERS
 from uard.lab.views.compare import compare
 from uard.lab.views.published import Published, packaged
@@ -457,3 +457,43 @@ def test_a_migration_that_is_killed_leaves_the_old_store_or_the_new_one(old, tmp
         assert path.read_bytes() == (HERE / "format-2.sqlite").read_bytes()
         Path(f"{path}.format-2").unlink(missing_ok=True)
         assert migrate(path).rows["results"] == store_seeds()
+
+
+def test_a_damaged_store_of_todays_format_is_not_said_to_be_well(old):
+    migrate(old)
+    data = old.read_bytes()
+    old.write_bytes(data[: 40 * 4096] + b"\xff" * 4096 + data[41 * 4096 :])
+    Path(f"{old}.format-2").unlink()
+    with pytest.raises(StoreError, match=r"could not be migrated .*; nothing was changed"):
+        migrate(old)
+
+
+def test_of_two_migrations_at_once_one_is_done_and_the_other_refused(old):
+    code = "import sys; from uard.cli.app import main; main(['migrate', sys.argv[1]])"
+    command = [sys.executable, "-c", code, str(old)]
+    both = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    said = [p.communicate()[1] for p in both]
+    assert sorted(p.returncode for p in both) == [0, 2]
+    assert "Traceback" not in "".join(said)
+    with closing(Store(old)) as store:
+        assert sum(len(store.have(c)) for c in CELLS) == store_seeds()
+    assert sorted(p.name for p in old.parent.iterdir()) == ["s.sqlite", "s.sqlite.format-2"]
+
+
+@pytest.mark.parametrize("metrics", ["{}", "[", "7", '{"trap_visits": "many"}'])
+def test_metrics_that_are_none_go_into_quarantine(old, metrics):
+    ((key, data),) = rows(old, "select key, data from results limit 1")
+    change(
+        old,
+        (
+            "update results set metrics = ?, checksum = ? where key = ? and data = ?",
+            metrics,
+            digest(data + metrics.encode()),
+            key,
+            data,
+        ),
+        ("insert into runs values ('gone', 'h', 'p', 1, 1, 'soon', 6, 7, 3, 2, null, null)",),
+    )
+    found = migrate(old)
+    assert found.rows["quarantine"] == 1
+    assert found.left["they are damaged (runs: began = 'soon': must be a finite number in [0, 2.53402e+11])"] == 1

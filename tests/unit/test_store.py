@@ -1,19 +1,26 @@
+import json
+import os
 import re
 import signal
 import sqlite3
 import subprocess
 import sys
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from uard import InvalidValueError
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
-from uard.lab.execution import runner
+from uard.lab.execution import rows, runner
+from uard.lab.execution.claims import Owner
 from uard.lab.execution.store import Store, StoreError
-from uard.lab.result import CorruptResultError, Result
-from uard.lab.study import results_of
+from uard.lab.result import CorruptResultError, Result, digest
+from uard.lab.study import Row, Study, results_of
+from uard.lab.views import leaderboard, status
+from uard.lab.views.compare import compare
 
 CELL, OTHER = Cell(episodes=3), Cell(episodes=4)
 TINY = Cell(TrapGrid(size=4, traps=((1, 2),), horizon=8), episodes=3)
@@ -257,3 +264,162 @@ store.put(slowly())
         store.put([(CELL, 1, result(1))])
         assert store.have(CELL) == {0, 1}
         assert store.quarantined() == []
+
+
+def tampered(path, metrics, **columns):
+    """Change a result and give it the checksum of what it then is."""
+    ((key, data, version, created),) = raw(path, "select key, data, version, created from results where seed = 1")
+    row = {"data": data, "version": version, "created": created, "metrics": json.dumps(metrics)} | columns
+    row["checksum"] = rows.checksum_of(key, 1, row["data"], row["metrics"])
+    raw(path, f"update results set {', '.join(f'{name} = ?' for name in row)} where seed = 1", *row.values())
+
+
+GOOD = result(1).metrics()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"metrics": {}}, "must be JSON with a number for each metric"),
+        ({"metrics": [1]}, "must be JSON with a number for each metric"),
+        ({"metrics": GOOD | {"hacks": "6.29"}}, "metrics hold hacks = '6.29': must be a finite number"),
+        ({"metrics": GOOD | {"true_return": float("nan")}}, "metrics hold true_return = nan: must be a finite number"),
+        ({"metrics": GOOD | {"true_return": True}}, "metrics hold true_return = True: must be a finite number"),
+        ({"metrics": GOOD | {"episode_length": 0.0}}, "episode_length = 0"),
+        ({"metrics": GOOD, "created": 1e18}, "created = 1e+18: must be a finite number in [0, "),
+        ({"metrics": GOOD, "created": -1.0}, "created = -1.0: must be a finite number in [0, "),
+        ({"metrics": GOOD, "version": b"\xff"}, "version = b'\\xff': must be text"),
+        ({"metrics": GOOD, "data": b"short"}, "it is no packed result"),
+    ],
+)
+def test_a_row_that_is_readable_but_means_nothing_is_named_everywhere(store, path, change, says):
+    store.put([(CELL, seed, result(seed)) for seed in range(3)])
+    tampered(path, **change)
+    with closing(Store(path, readonly=True)) as read:
+        assert read.get(CELL, range(3)).keys() == {0, 2}
+        (damaged,) = read.damaged
+        assert (damaged.key, damaged.seed) == (CELL.key, 1)
+        assert says in damaged.reason
+        assert [x.seeds for x in leaderboard.lines(read)] == [3 if "data" in change else 2]
+        study = Study("s", "", "", (Row((), CELL),))
+        found = status.status(read, [study])
+        assert found.studies[0].finished == (3 if "data" in change else 2)
+        assert said_of(found) == [f"  cell {CELL.key}, seed 1: {damaged.reason}"]
+        assert read.quarantined() == []
+    assert store.get(CELL, range(3)).keys() == {0, 2}
+    assert [(key, seed) for key, seed, _ in store.quarantined()] == [(CELL.key, 1)]
+
+
+def said_of(found):
+    return status.said_of_damaged(found.damaged)[1:]
+
+
+def test_a_result_of_another_seed_or_cell_is_not_taken_for_this_one(store, path):
+    store.put([(CELL, 0, result(0)), (OTHER, 5, result(5))])
+    raw(path, "update results set seed = 1 where seed = 0")
+    raw(path, "update results set key = ? where seed = 5", CELL.key)
+    with closing(Store(path, readonly=True)) as read:
+        assert read.cells() == []
+        assert {d.reason for d in read.damaged} == {"checksum does not match"}
+    assert (store.have(CELL), store.have(OTHER)) == (set(), set())
+
+
+def test_rows_from_before_the_checksum_covered_key_and_seed_are_read(store, path):
+    store.put([(CELL, 0, result(0))])
+    ((data, metrics),) = raw(path, "select data, metrics from results")
+    raw(path, "update results set checksum = ?", digest(data + metrics.encode()))
+    assert same(store.get(CELL, [0])[0], result(0))
+
+
+def test_a_configuration_that_its_key_is_not_of_shows_no_numbers_and_is_mended_when_the_cell_is_trained(store, path):
+    store.put([(CELL, 0, result(0))])
+    raw(path, "update cells set config = replace(config, '\"noise\": 0.0', '\"noise\": 9.0')")
+    with closing(Store(path, readonly=True)) as read:
+        assert (read.cells(), read.configs()) == ([], {})
+        assert [(d.key, d.seed) for d in read.damaged] == [(CELL.key, None)]
+        with pytest.raises(InvalidValueError, match="in common"):
+            compare(read, store)
+    store.put([(CELL, 1, result(1))])
+    assert store.configs() == {CELL.key: CELL.config()}
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "value"), [("runs", "began", "soon"), ("runs", "pid", -1), ("failures", "created", 1e18)]
+)
+def test_a_damaged_row_about_work_is_named(store, path, table, column, value):
+    owner = Owner.here()
+    store.begin(owner, 1)
+    store.fail([(CELL, 3)], "ValueError: no", owner)
+    owner.stop()
+    raw(path, f"update {table} set {column} = ?", value)
+    with pytest.raises(StoreError, match=rf"table {table}, row .*: {column} = .*: must be .*; delete that row"):
+        status.status(store, [])
+
+
+def test_looking_leaves_nothing_behind(path):
+    before = filled(path, 3)
+    with closing(Store(path, readonly=True)) as store:
+        assert store.have(CELL) == {0, 1, 2}
+        with pytest.raises(StoreError, match="cannot be written"):
+            store.put([(CELL, 9, result())])
+    assert path.read_bytes() == before
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_what_a_writer_has_in_its_log_is_seen(store, path):
+    store.put([(CELL, 0, result())])
+    with closing(Store(path, readonly=True)) as read:
+        assert read.have(CELL) == {0}
+        store.put([(CELL, 1, result())])
+        assert read.have(CELL) == {0, 1}
+
+
+READ = """
+import os, sys
+from contextlib import closing
+from uard.lab.cell import Cell
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store, StoreError
+
+if os.getuid() == 0:
+    os.setgid(65534)
+    os.setuid(65534)
+cell = Cell(episodes=3)
+for readonly in (True, False):
+    with closing(Store(sys.argv[1], readonly=readonly)) as store:
+        print(sorted(store.have(cell)), runner.run([(cell, 0), (cell, 1)], store))
+        try:
+            runner.run([(cell, 7)], store)
+        except StoreError as error:
+            print("cannot be written" in str(error))
+"""
+
+
+@pytest.mark.parametrize("left", ["nothing", "wal", "wal and shm"])
+def test_a_store_in_a_read_only_place_is_read(tmp_path, left):
+    """Permissions do not bind root, who therefore looks as somebody else."""
+    path = tmp_path / "s.sqlite"
+    filled(path, 1)
+    with closing(Store(path)) as store:
+        store.put([(CELL, 1, result(1, 100))])
+        folder = tmp_path / "closed"
+        folder.mkdir()
+        for suffix in {"nothing": ("",), "wal": ("", "-wal"), "wal and shm": ("", "-wal", "-shm")}[left]:
+            (folder / f"s.sqlite{suffix}").write_bytes(Path(f"{path}{suffix}").read_bytes())
+    if left == "nothing":  # it was closed, and everything is in the file
+        (folder / "s.sqlite").write_bytes(path.read_bytes())
+    names = sorted(p.name for p in folder.iterdir())
+    for file in (*folder.iterdir(), folder):
+        file.chmod(0o555 if file is folder else 0o444)
+    opened = [p for p in (tmp_path, *tmp_path.parents) if not p.stat().st_mode & 1]
+    for parent in opened:
+        parent.chmod(parent.stat().st_mode | 1)
+    try:
+        command = [sys.executable, "-c", READ, str(folder / "s.sqlite")]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | {"TMPDIR": "/tmp"})
+    finally:
+        for parent in opened:
+            parent.chmod(parent.stat().st_mode & ~1)
+        folder.chmod(0o755)
+    assert (done.returncode, done.stdout) == (0, "[0, 1] 0\nTrue\n" * 2), done.stderr
+    assert sorted(p.name for p in folder.iterdir()) == names

@@ -1,4 +1,5 @@
 import logging
+import tracemalloc
 from contextlib import closing
 
 import numpy as np
@@ -9,8 +10,8 @@ from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
 from uard.lab.execution import runner
 from uard.lab.execution.claims import Owner
-from uard.lab.execution.store import Store
-from uard.lab.result import METRICS
+from uard.lab.execution.store import Store, WorkerRun
+from uard.lab.result import METRICS, Result
 from uard.lab.study import Study, row
 from uard.lab.views.status import duration, lines, status, titles
 from uard.lab.views.tensorboard import POINTS, Events
@@ -123,3 +124,30 @@ def test_the_library_logs_under_its_name_and_leaves_the_root_alone(tmp_path, cap
     ]
     assert all(r.name.startswith("uard.") for r in caplog.records)
     assert (list(logging.getLogger().handlers), logging.getLogger().level) == root
+
+
+def test_status_counts_a_seed_of_a_thousand_millions_without_listing_them(tmp_path):
+    cell, far = STUDY.rows[0].cell, 10**9
+    log = np.ones((5, 6), np.float32)
+    with closing(Store(tmp_path / "s.sqlite")) as store:
+        store.put([(cell, far, Result(log, 5, np.zeros(1), {}))])
+        tracemalloc.start()
+        (line,) = status(store, [STUDY]).studies
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert (line.seeds, line.finished, line.missing) == (far + 1, 1, 2 * (far + 1) - 1)
+    assert peak < 10e6
+
+
+def test_a_heartbeat_from_the_future_is_said_to_be_one(store):
+    run = WorkerRun(Owner("t", "far", "another kernel", 7, 1), 1000.0, 1.9e9, 3, 1, 0, 60.0, None, 1)
+    (said,) = lines([run], now=1.9e9 - 3600)
+    assert "about 60 s left" in said
+    assert "its last heartbeat is 60 min ahead of this machine's clock" in said
+
+
+def test_a_title_of_long_letters_makes_a_name_that_fits(tmp_path):
+    cell = STUDY.rows[0].cell
+    place = Events(tmp_path, {cell.key: "長" * 300}).place(cell, 0)
+    assert len(place.parent.name.encode()) <= 255
+    place.mkdir(parents=True)

@@ -29,9 +29,7 @@ def open_for_reading(path: str, leaving: ExitStack) -> sqlite3.Connection:
     """
     if can_be_written(path):
         # Read-only connections make the files -wal and -shm and cannot remove them; one that could write does.
-        db = _opened(leaving, path, "mode=rw")
-        db.execute("pragma query_only = on")
-        return db
+        return _opened(leaving, path, "mode=rw")
     wal = Path(f"{path}-wal")
     if not wal.exists() or not wal.stat().st_size:  # else immutable would miss what is in there
         return _opened(leaving, path, "immutable=1")
@@ -47,4 +45,6 @@ def open_for_reading(path: str, leaving: ExitStack) -> sqlite3.Connection:
 
 
 def _opened(leaving: ExitStack, path: str, options: str) -> sqlite3.Connection:
-    return leaving.enter_context(closing(sqlite3.connect(f"file:{quote(path)}?{options}", timeout=60, uri=True)))
+    db = leaving.enter_context(closing(sqlite3.connect(f"file:{quote(path)}?{options}", timeout=60, uri=True)))
+    db.execute("pragma query_only = on")
+    return db
