@@ -124,7 +124,7 @@ def config_of(key: Any, text: Any) -> dict[str, Any] | None:
     Examples:
         >>> from uard.lab.cell import Cell
         >>> text = json.dumps(Cell().config())
-        >>> config_of(Cell().key, text) == Cell().config(), config_of(Cell(noise=1.0).key, text)
+        >>> config_of(Cell().key, text) == Cell().config(), config_of(Cell(episodes=3).key, text)
         (True, None)
     """
     try:
