@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from uard._support import signals
 from uard.lab.cell import Cell
 from uard.lab.execution.batching import Job, batches, shape_of
 from uard.lab.execution.claims import HEARTBEAT, Owner
@@ -106,6 +107,7 @@ def run(
         while todo:
             with closing(_train(batches(todo), workers, work.folder, work.claim, engine)) as outcomes:
                 for batch, answer in outcomes:
+                    signals.check()  # what it has disturbed must not be recorded as a failure
                     work.record(batch, answer)
             todo = work.wait_for_others()
     if work.failures:
@@ -191,6 +193,7 @@ class _Work:
         if waiting:
             log.info("waiting for %d seeds that other processes train", len(waiting))
         while waiting:
+            signals.check()
             held, free, failed = _sort_out(waiting, self._store, self._failed_before)
             for error in dict.fromkeys(failed.values()):
                 self._fail([job for job, e in failed.items() if e == error], error)
