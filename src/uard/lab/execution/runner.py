@@ -21,6 +21,7 @@ import numpy as np
 
 from uard._support import signals
 from uard.lab.cell import Cell
+from uard.lab.config import check_names
 from uard.lab.execution.batching import Job, batches, shape_of
 from uard.lab.execution.claims import HEARTBEAT, Owner
 from uard.lab.execution.forecast import Forecast
@@ -92,6 +93,7 @@ def run(
         engine: What trains the batches instead of processes on this machine: ``uard.lab.execution.cluster.Ray``, say.
 
     Raises:
+        InvalidValueError: a cell has a class that is local to a function, and the store is a file.
         StudyFailedError: some jobs raised; all others are stored, and the store says why. Each is tried once.
         StoreError: the store cannot be written; what was finished before is safe.
     """
@@ -119,6 +121,9 @@ def _missing(jobs: Sequence[Job], store: Store) -> list[Job]:
     wanted: dict[Cell, list[int]] = {}
     for cell, seed in jobs:
         wanted.setdefault(cell, []).append(seed)
+    if store.path != ":memory:":
+        for cell in wanted:
+            check_names(cell.config())
     return [(cell, seed) for cell, seeds in wanted.items() for seed in store.missing(cell, dict.fromkeys(seeds))]
 
 

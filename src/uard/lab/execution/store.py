@@ -18,7 +18,7 @@ from urllib.parse import quote
 
 from uard import __version__
 from uard.lab.cell import Cell
-from uard.lab.config import FORMAT
+from uard.lab.config import FORMAT, check_names
 from uard.lab.execution.claims import Owner
 from uard.lab.result import CorruptResultError, Result, digest
 
@@ -218,8 +218,11 @@ class Store:
                     self._db.execute(f"delete from {table} where key = ? and seed = ?", (key, seed))
 
     def _describe(self, cell: Cell) -> None:
-        config = json.dumps(cell.config(), sort_keys=True)
-        self._db.execute("insert or ignore into cells values (?, ?)", (cell.key, config))
+        config = cell.config()
+        if self.path != ":memory:":
+            check_names(config)
+        text = json.dumps(config, sort_keys=True)
+        self._db.execute("insert or ignore into cells values (?, ?)", (cell.key, text))
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
