@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import signal
 import sqlite3
 import stat
@@ -114,7 +115,7 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
         ("run --mitigation urad", "mitigation = 'urad': must be one of *did you mean 'uard'?"),
         (
             "run TomatoWatering",
-            "agent = QLearning(*does not fit into tables: dqn, ensemble-dqn",
+            "agent = 'q-learning': must be one that can work in TomatoWatering, which*into tables: dqn, ensemble-dqn",
         ),
         ("run BoatRace --noise-fraction 0.3", "noise_fraction = 0.3: must be left out where no trap pays"),
         ("run --agent dqn --feedback tabel", "feedback = 'tabel': must be one of *did you mean 'table'?"),
@@ -126,6 +127,14 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
         ("run --set-mitigation lamda=5", "mitigation setting = 'lamda': must be one of *did you mean 'lam'?"),
         ("run --set-agent headz=5", "agent setting = 'headz': must be one of *did you mean 'heads'?"),
         ("run --set size", "--set = 'size': must be name=value"),
+        ("run --set size=5 --set size=6", "--set = 'size=6': must be left out: size was set to 5 before"),
+        (
+            "run --set-agent heads=1 --set-agent heads=1",
+            "--set-agent = 'heads=1': must be left out: heads was set to 1",
+        ),
+        (f"run --set size={'9' * 5000}", "size = '99*must be a whole number in [2, 256]"),
+        (f"run --set traps={'[' * 100_000}", "traps = '[[*must be a list of"),
+        ("run --query doubtful", "query = 'doubtful': must be random, except on a simulator"),
         ("run --set size=-5", "size = -5: must be a whole number in [2, 256]"),
         ("run --set traps=[[0,0]]", "traps[0] = (0, 0): must be another cell than the start (0, 0)"),
         ("run --set traps=[[5,5]]", "traps[0] = (5, 5): must be another cell than the goal (5, 5)"),
@@ -191,6 +200,32 @@ def test_silly_input_ends_the_real_program_with_2(arguments):
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ("run --seeds two", "'two' must be a whole number"),
+        ("run --seeds 1_0", "'1_0' must be a whole number"),
+        ("reproduce control --seeds 2.5", "'2.5' must be a whole number"),
+        ("run --noise much", "'much' must be a number"),
+        ("run --noise-fraction much", "'much' must be a number"),
+        ("run --steps many", "'many' must be a whole number"),
+    ],
+)
+def test_what_is_no_number_is_said_in_words(arguments, says, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(arguments.split())
+    assert stopped.value.code == 2
+    assert says in " ".join(re.sub("[│─╭╮╰╯]", " ", capsys.readouterr().err).split())
+
+
+@pytest.mark.parametrize("arguments", ["list", "run --help", "doctor CartPole-v1 --json -", "doctor CartPole-v1"])
+def test_a_reader_who_has_gone_is_no_accident(arguments, tmp_path):
+    """As in ``uard list | head -1``."""
+    command = f"{UARD} {arguments} | true; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", "")
 
 
 def test_a_run_that_diverges_ends_with_1(capsys):
@@ -295,10 +330,15 @@ def test_what_others_wrote_is_printed_as_it_is(capsys):
     terminal.table(["[b]a[/b]", "b"], [["x[/red]", "\x1b[31mred"], ["\r\x07", "y"]], "a [title]", marked=(1,))
     terminal.glossary("t[/]", {"[name]": "\x9b0m [/text]"})
     terminal.warning(Console(highlight=False), "[bold]no[/bold]\x1b]0;title\x07")
+    terminal.say(Console(highlight=False), "a\u202eb\udcff\u2028")
+    terminal.table(["n\x1b"], [[f"{i}\r"] for i in range(600)], "many\x07")
     out = capsys.readouterr().out
     for text in ("[b]a[/b]", "x[/red]", r"\x1b[31mred", r"\r\x07", "a [title]", "t[/]", "[name]", r"\x9b0m [/text]"):
         assert text in out
     assert r"warning: [bold]no[/bold]\x1b]0;title\x07" in out
+    assert r"a\u202eb\udcff\u2028" in out
+    assert "many\\x07\nn\\x1b\n0\\r\n1\\r\n" in out
+    assert not re.search("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202e]", out)
 
 
 def test_an_interrupt_is_no_accident(tmp_path):

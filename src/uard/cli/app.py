@@ -88,7 +88,7 @@ def _parsed(arguments: list[str], console: Console) -> Command:
     """Return the command with its options; those of packages are imported only if none of ours is named."""
     import tyro
 
-    from uard.cli import terminal
+    from uard.cli import settings, terminal
     from uard.cli.commands import brought, own
 
     commands = own()
@@ -99,7 +99,8 @@ def _parsed(arguments: list[str], console: Console) -> Command:
         commands = commands | {plugin.name: command for plugin, command in theirs.items()}
     kinds = tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in commands.items())
     union: Any = Union[kinds]  # noqa: UP007 (of as many as there are)
-    return tyro.cli(union, prog="uard", args=arguments, description="Rewards that cannot be fully trusted.")
+    text = "Rewards that cannot be fully trusted."
+    return tyro.cli(union, prog="uard", args=arguments, description=text, registry=settings.numbers())
 
 
 def _of_users() -> tuple[type[Exception], ...]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from uard import InvalidValueError, __version__
+from uard._support.text import printable
 from uard.cli import terminal
 from uard.cli.settings import Pairs
 from uard.cli.settings import mitigation as mitigation_named
@@ -62,7 +63,7 @@ class Doctor:
         if self.json is not None:
             terminal.write_json({"version": __version__} | found.as_data(), self.json)
         if self.json != "-":
-            print(found)
+            print(printable(str(found)))
         if found.count("danger") or (self.strict and found.count("warning")):
             sys.exit(1)
 

@@ -10,6 +10,7 @@ from tyro.conf import Positional
 
 from uard import InvalidValueError, _checks
 from uard._support import files
+from uard._support.text import counted
 from uard.cli import progress, terminal, training
 from uard.cli.list import broken
 from uard.cli.settings import Names
@@ -126,7 +127,7 @@ class Reproduce:
             jobs,
             store,
             console,
-            f"{len(chosen)} studies, {len(jobs)} runs",
+            f"{counted(len(chosen), 'study', 'studies')}, {counted(len(jobs), 'run')}",
             self.watch,
             workers=self.workers,
             studies=chosen,
@@ -134,4 +135,6 @@ class Reproduce:
             again=f"only these again: uard reproduce {names}--seeds {self.seeds} --store {self.store} --failed\n"
             f"their tracebacks: uard status {names}--store {self.store} --errors",
         )
-        terminal.say(console, f"{trained} runs trained, {len(jobs) - trained} were in {self.store} already")
+        before = len(jobs) - trained
+        there = f"{before} {'was' if before == 1 else 'were'} in {self.store} already"
+        terminal.say(console, f"{counted(trained, 'run')} trained, {there}")

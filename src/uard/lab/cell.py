@@ -115,7 +115,7 @@ class Cell:
             self._put("steps", int(steps))
             self._put("episodes", EPISODES)
         elif self.steps is not None:
-            raise _checks.InvalidValueError("steps", self.steps, "left out but on a simulator; see episodes")
+            raise _checks.InvalidValueError("steps", self.steps, "left out, except on a simulator: see episodes")
         if self.snapshots and not trainer.snapshots:
             raise _checks.InvalidValueError("snapshots", self.snapshots, "0 for an agent that keeps no tables")
 
@@ -130,7 +130,9 @@ class Cell:
             raise _checks.InvalidValueError("rating_model", model, f"{allowed}{why}")
         self._put("rating_model", settled("rating_model", model))
         if _checks.choose("query", self.query, QUERIES) not in trainer.queries:
-            raise _checks.InvalidValueError("query", self.query, f"{' or '.join(trainer.queries)} but on a simulator")
+            raise _checks.InvalidValueError(
+                "query", self.query, f"{' or '.join(trainer.queries)}, except on a simulator"
+            )
 
     def config(self) -> dict[str, Any]:
         """Return the whole configuration as plain data; see ``uard.lab.config``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, get_args
 
 from uard import _checks, plugins
@@ -119,7 +119,14 @@ def trainer(agent: Any, environment: Any) -> Trainer:
         why = "which does not fit into tables"
     else:
         why = "whose actions are discrete"
-    raise _checks.InvalidValueError("agent", agent, f"one that can work in {type(environment).__name__}, {why}: {able}")
+    where = _known(environment, ENVIRONMENTS) or type(environment).__name__
+    shown = _known(agent, agents(environment)) or _known(agent, AGENTS) or agent
+    raise _checks.InvalidValueError("agent", shown, f"one that can work in {where}, {why}: {able}")
+
+
+def _known(value: Any, names: Mapping[str, Any]) -> str:
+    """Return the name of an environment or agent as it is listed; no text if it has none."""
+    return next((name for name, other in names.items() if other == value), "")
 
 
 def agents(environment: Any = None) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from uard._support import signals
+from uard._support.text import counted
 from uard.lab.cell import Cell
 from uard.lab.config import check_names
 from uard.lab.execution.batching import Job, batches, shape_of
@@ -60,7 +61,9 @@ class StudyFailedError(RuntimeError):
         """Name the first failed cell and its error."""
         first = failures[0]
         lost = sum(len(f.jobs) for f in failures)
-        super().__init__(f"{lost} seeds failed, the rest is stored; first: {first.jobs[0][0]}\n{first.error}")
+        super().__init__(
+            f"{counted(lost, 'seed')} failed, the rest is stored; first: {first.jobs[0][0]}\n{first.error}"
+        )
         self.failures = tuple(failures)
 
 
