@@ -446,6 +446,8 @@ def test_sections_of_packages_join_the_report(broken, tmp_path):
     [
         ({"id": "Two words"}, "id = 'Two words': must be small letters"),
         ({"order": float("nan")}, "order = nan: must be a finite number"),
+        ({"js": "'</SCRIPT>'"}, "js = \"'</SCRIPT>'\": must be without </script>"),
+        ({"css": "</style>"}, "css = '</style>': must be without </style>"),
         ({"files": {"../up": ""}}, "files = '../up': must be a plain name"),
         ({"files": {"index.html": ""}}, "files = 'index.html': must be a plain name, none of index.html"),
     ],
