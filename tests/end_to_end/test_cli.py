@@ -6,8 +6,9 @@ import sqlite3
 import stat
 import subprocess
 import sys
+import threading
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from unittest.mock import ANY
 
@@ -27,6 +28,7 @@ from uard.method import mitigations as mitigation
 from uard.ratings.panels import PANELS
 
 UARD = str(Path(sys.executable).parent / "uard")
+LONG = "x" * 300  # no file may have such a name
 RUN = ["run", "TrapGrid", "--set", "size=5", "--set", "traps=[[2,2]]", "--episodes", "60", "--seeds", "2"]
 
 
@@ -155,6 +157,29 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
         ("run --json .", "json = '.': must be a file, not a folder"),
         ("run --store file", "store = 'file': must be a result store"),
         ("run --store file/s.sqlite", "store = 'file/s.sqlite': must be in a folder that can be written"),
+        ("run --store .", "store = '.': must be a file, not a folder"),
+        ("run --store=", "store = '': must be a file, not a folder"),
+        ("reproduce --store .", "store = '.': must be a file, not a folder"),
+        ("reproduce --report=", "report = '': must be in a folder that can be written"),
+        ("reproduce --report file", "report = 'file': must be in a folder that can be written"),
+        ("run --tensorboard=", "tensorboard = '': must be in a folder"),
+        ("run --json=", "json = '': must be a file that can be written"),
+        (f"run {LONG}", "environment = 'xx*...: must be one of"),
+        (f"run --store {LONG}", "store = 'xx*must be a file that can be written"),
+        (f"run --json {LONG}", "json = 'xx*File name too long"),
+        (f"run --log {LONG}", "log = 'xx*File name too long"),
+        (f"run --tensorboard {LONG}", "tensorboard = 'xx*File name too long"),
+        (f"doctor {LONG}", "log = 'xx*...: must be a file that ends in"),
+        (f"doctor {LONG}.csv", "log = 'xx*File name too long"),
+        (f"leaderboard --store {LONG}", "store = 'xx*...: must be a file that is there"),
+        (f"leaderboard --out {LONG}", "store = 'results/uard.sqlite': must be a file that is there"),
+        (f"status --store {LONG}", "store = 'xx*there is no such file"),
+        (f"status {LONG}", "study = 'xx*...: must be one of"),
+        (f"compare {LONG} file", "store = 'xx*there is no such file"),
+        (f"migrate {LONG}", "path = '*...: must be"),
+        (f"reproduce control --extract {LONG}", "extract = 'xx*File name too long"),
+        (f"reproduce --report {LONG}", "report = 'xx*File name too long"),
+        (f"reproduce control --mitigation {LONG}", "mitigation = 'xx*...: must be one of"),
         ("reproduce nonsense", "study = 'nonsense': must be one of abstention, "),
         ("reproduce contrl", "study = 'contrl': must be one of *did you mean 'control'?"),
         ("reproduce control --seeds 1", "seeds = 1: must be a whole number in [2, "),
@@ -324,6 +349,51 @@ def test_json_goes_where_it_is_told_and_replaces_no_device(tmp_path):
     assert (tmp_path / "link.json").is_symlink()
     assert json.loads((tmp_path / "real.json").read_text()) == expected
     assert sorted(p.name for p in tmp_path.iterdir()) == ["link.json", "log.csv", "real.json"]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A folder with a log and a store."""
+    folder = tmp_path_factory.mktemp("finished")
+    (folder / "log.csv").write_text("reward,rating_a,rating_b\n" + "".join(f"{i},{i},{i + 1}\n" for i in range(50)))
+    store = ["--seeds", "2", "--store", str(folder / "s.sqlite")]
+    cli.main(["reproduce", "control", *store, "--workers", "1", "--extract", str(folder / "extract.json")])
+    return folder
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "doctor log.csv --json",
+        "run --set size=5 --episodes 20 --seeds 1 --json",
+        "best-of-n --seeds 2 --json",
+        "status --store s.sqlite --json",
+        "compare s.sqlite s.sqlite --json",
+        "reproduce control --seeds 2 --store s.sqlite --extract",
+        "leaderboard --store s.sqlite --out",
+    ],
+)
+def test_every_output_goes_through_pipes_and_links_and_replaces_no_device(command, finished, tmp_path, monkeypatch):
+    monkeypatch.chdir(finished)
+    (tmp_path / "real").write_text("old")
+    (tmp_path / "link").symlink_to("real")
+    os.mkfifo(tmp_path / "fifo")
+    got = []
+    reader = threading.Thread(target=lambda: got.append((tmp_path / "fifo").read_text()), daemon=True)
+    reader.start()
+    for name in ("fifo", "link"):
+        cli.main([*command.split(), str(tmp_path / name)])
+    reader.join(10)
+    assert (tmp_path / "fifo").is_fifo()
+    assert (tmp_path / "link").is_symlink()
+    written = (tmp_path / "real").read_text()
+    assert written.startswith(("{", "<!doctype html>"))
+    assert len(got[0]) == pytest.approx(len(written), rel=0.1), "but for times"
+    with suppress(PermissionError):  # only root may make one
+        os.mknod(tmp_path / "null", 0o666 | stat.S_IFCHR, os.makedev(1, 3))
+        cli.main([*command.split(), str(tmp_path / "null")])
+        assert (tmp_path / "null").is_char_device()
+    assert {p.name for p in tmp_path.iterdir()} - {"null"} == {"fifo", "link", "real"}
 
 
 def test_what_others_wrote_is_printed_as_it_is(capsys):

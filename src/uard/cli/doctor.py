@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,7 +72,7 @@ class Doctor:
         """Return the log: of a file if it looks like one, else of an environment."""
         from uard.ratings import readers, rollout
 
-        if Path(self.log).suffix.lower() in readers.FORMATS or Path(self.log).exists():
+        if Path(self.log).suffix.lower() in readers.FORMATS or os.path.exists(self.log):  # Path's raises
             return readers.read(self.log, self.reward, self.ratings or None)
         import gymnasium
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,7 +30,7 @@ class Leaderboard:
         from uard.lab.execution.store import Store
         from uard.lab.views import leaderboard
 
-        if not Path(self.store).is_file():
+        if not os.path.isfile(self.store):  # Path's raises for a long name
             allowed = "a file that is there; `uard reproduce` and `uard run --store` make one"
             raise InvalidValueError("store", self.store, allowed)
         files.prepare(self.out, "out")

@@ -75,7 +75,7 @@ class Reproduce:
 
             line = f"uard reproduce {' '.join(self.studies)} --seeds {self.seeds}"
             terminal.write_json(published.extract(chosen, store, seeds, line), self.extract, "extract", indent=None)
-        if self.report:
+        if self.report is not None:
             from uard.lab.views import page
 
             with progress.spinner(console, "writing the report"):
@@ -108,9 +108,9 @@ class Reproduce:
         """Refuse before training, not after it, what cannot be written."""
         from uard.lab import studies
 
-        if self.report and {s.name for s in chosen} < {s.name for s in studies.grid()}:
+        if self.report is not None and {s.name for s in chosen} < {s.name for s in studies.grid()}:
             raise InvalidValueError("report", self.report, "left out unless all grid studies are run")
-        if self.report:
+        if self.report is not None:
             files.prepare_folder(self.report, "report")
         terminal.check_json(self.extract, "extract")
         for name, given in (("report", self.report), ("extract", self.extract)):

@@ -74,7 +74,7 @@ class Run:
         _checks.whole("seeds", self.seeds, low=1, high=100_000)
         terminal.check_json(self.json)
         cell, trap_reward = self._cell()
-        store = Store(self.store or ":memory:")
+        store = Store(":memory:" if self.store is None else self.store)
         seeds = range(self.seeds)
         started = time.perf_counter()
         jobs = [(cell, s) for s in seeds]

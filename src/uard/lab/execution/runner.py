@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uard._support import signals
+from uard._support import files, signals
 from uard._support.text import counted
 from uard.lab.cell import Cell
 from uard.lab.config import check_names
@@ -292,7 +292,7 @@ def _kept(answer: Result | DivergedError | str, store: Store) -> Result | str:
     file = folder / f"{answer.name}.npz"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with file.open("wb") as stream:
+        with files.replacing(file) as stream:
             np.savez(stream, **answer.good)  # type: ignore[arg-type]
     except OSError as error:
         return f"{answer}; its last good state could not be written to {file} ({error})"

@@ -6,6 +6,7 @@ It also says who is training what, so that several processes share the work, and
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 import time
 from collections import Counter, defaultdict
@@ -152,7 +153,9 @@ class Store:
             StoreError: the folder cannot be written, or the file is no sound result store, or is not there.
         """
         self.path = str(path)
-        if readonly and not Path(self.path).is_file():
+        if not self.path or os.path.isdir(self.path):
+            raise StoreError(f"store = {self.path!r}: must be a file, not a folder")
+        if readonly and not os.path.isfile(self.path):  # Path's raises for a long name
             raise StoreError(f"store = {self.path!r}: must be a result store, but there is no such file")
         try:
             if readonly:
