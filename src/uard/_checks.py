@@ -35,7 +35,10 @@ class UnknownNameError(InvalidValueError):
 
 def short(value: object) -> str:
     """Return the value as text of at most 200 characters."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except Exception:  # of somebody else's class; of an int of 5000 digits
+        text = f"<{type(value).__name__}>"
     return text if len(text) <= 200 else text[:197] + "..."  # a path must be legible
 
 
@@ -43,6 +46,15 @@ def is_frozen(value: object) -> bool:
     """Whether ``value`` is a frozen dataclass."""
     parameters = getattr(type(value), "__dataclass_params__", None)
     return parameters is not None and parameters.frozen
+
+
+def not_frozen(value: object, kind: type) -> str | None:
+    """Say what ``value`` must be if it is no frozen dataclass of a class; None if it is one."""
+    if isinstance(value, kind) and is_frozen(value):
+        return None
+    article = "an" if kind.__name__[0] in "AE" else "a"
+    hint = f", and this is a class: {value.__name__}(...) makes one" if isinstance(value, type) else ""
+    return f"a frozen dataclass that is {article} {kind.__name__}{hint}"
 
 
 def choose(field: str, value: str, known: Iterable[str]) -> str:
@@ -93,7 +105,7 @@ def _plain(value: Any) -> Any:
     return value.item() if getattr(value, "shape", None) == () else value
 
 
-def whole(field: str, value: Any, *, low: int = 0, high: float = math.inf) -> None:
+def whole(field: str, value: Any, *, low: float = 0, high: float = math.inf) -> None:
     """Check that ``value`` is an integer in ``[low, high]``."""
     good = isinstance(value, int | np.integer) and not isinstance(value, bool) and low <= value <= high
     if not good:

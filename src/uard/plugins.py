@@ -97,24 +97,30 @@ class Plugin:
         function = self.get()
         return self._tried(lambda: function(*arguments))
 
-    def load(self, is_one: Callable[[Any], bool]) -> Callable[..., Any]:
-        """Return what builds an environment, an agent or a mitigation.
+    def make(self, fault: Callable[[Any], str | None], **parameters: Any) -> Any:
+        """Build an environment, an agent or a mitigation.
 
         Args:
-            is_one: Whether an object is of this plugin's kind.
+            fault: Says what an object must be if it cannot be used as this plugin's kind; None if it can.
+            parameters: Handed to what the entry point names.
 
         Raises:
-            PluginError: it cannot be imported or called, or what it returns is of another kind.
+            PluginError: it cannot be imported or called, or what it returns without parameters cannot be used.
+            InvalidValueError: from what it builds, for the parameters.
         """
         made = self.call()
-        if not (is_one(made) and _checks.is_frozen(made)):
-            article = "an" if self.kind[0] in "ae" else "a"
-            raise PluginError(self, f"{_checks.short(made)} is no frozen dataclass that is {article} {self.kind}")
-        return self.get()
+        if (why := fault(made)) is not None:
+            raise PluginError(self, f"what it gives, {_checks.short(made)}, must be {why}")
+        if not parameters:
+            return made
+        function = self.get()
+        return self._tried(lambda: function(**parameters), (_checks.InvalidValueError, TypeError))
 
-    def _tried(self, action: Callable[[], Any]) -> Any:
+    def _tried(self, action: Callable[[], Any], through: tuple[type[Exception], ...] = ()) -> Any:
         try:
             return action()
+        except through:
+            raise
         except (Exception, SystemExit) as error:  # a package must not end this process either
             raise PluginError(self, f"{type(error).__name__}: {error}") from error
 
@@ -169,7 +175,7 @@ def pick(kind: str, name: str, own: Container[str], names: list[str]) -> Plugin:
 
     Raises:
         PluginError: several packages bring it.
-        UnknownNameError: there is none; with the nearest name.
+        UnknownNameError: there is none, or it is uard's own; with the nearest name.
     """
     usable = {}
     for plugin in found(kind):
@@ -178,7 +184,9 @@ def pick(kind: str, name: str, own: Container[str], names: list[str]) -> Plugin:
             usable[plugin.name] = plugin
         elif plugin.name == name and name not in own:
             raise PluginError(plugin, why)
-    return usable[_checks.choose(kind, name, [*names, *usable])]
+    if name not in usable:
+        raise _checks.UnknownNameError(kind, name, {*names, *usable} - {name})
+    return usable[name]
 
 
 def _taken(plugin: Plugin, own: Container[str]) -> str | None:

@@ -1,12 +1,14 @@
 import json
 import os
+import re
 import signal
 import sqlite3
 import stat
 import subprocess
 import sys
+import threading
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from unittest.mock import ANY
 
@@ -26,6 +28,7 @@ from uard.method import mitigations as mitigation
 from uard.ratings.panels import PANELS
 
 UARD = str(Path(sys.executable).parent / "uard")
+LONG = "x" * 300  # no file may have such a name
 RUN = ["run", "TrapGrid", "--set", "size=5", "--set", "traps=[[2,2]]", "--episodes", "60", "--seeds", "2"]
 
 
@@ -114,7 +117,7 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
         ("run --mitigation urad", "mitigation = 'urad': must be one of *did you mean 'uard'?"),
         (
             "run TomatoWatering",
-            "agent = QLearning(*does not fit into tables: dqn, ensemble-dqn",
+            "agent = 'q-learning': must be one that can work in TomatoWatering, which*into tables: dqn, ensemble-dqn",
         ),
         ("run BoatRace --noise-fraction 0.3", "noise_fraction = 0.3: must be left out where no trap pays"),
         ("run --agent dqn --feedback tabel", "feedback = 'tabel': must be one of *did you mean 'table'?"),
@@ -126,6 +129,14 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
         ("run --set-mitigation lamda=5", "mitigation setting = 'lamda': must be one of *did you mean 'lam'?"),
         ("run --set-agent headz=5", "agent setting = 'headz': must be one of *did you mean 'heads'?"),
         ("run --set size", "--set = 'size': must be name=value"),
+        ("run --set size=5 --set size=6", "--set = 'size=6': must be left out: size was set to 5 before"),
+        (
+            "run --set-agent heads=1 --set-agent heads=1",
+            "--set-agent = 'heads=1': must be left out: heads was set to 1",
+        ),
+        (f"run --set size={'9' * 5000}", "size = '99*must be a whole number in [2, 256]"),
+        (f"run --set traps={'[' * 100_000}", "traps = '[[*must be a list of"),
+        ("run --query doubtful", "query = 'doubtful': must be random, except on a simulator"),
         ("run --set size=-5", "size = -5: must be a whole number in [2, 256]"),
         ("run --set traps=[[0,0]]", "traps[0] = (0, 0): must be another cell than the start (0, 0)"),
         ("run --set traps=[[5,5]]", "traps[0] = (5, 5): must be another cell than the goal (5, 5)"),
@@ -146,6 +157,29 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
         ("run --json .", "json = '.': must be a file, not a folder"),
         ("run --store file", "store = 'file': must be a result store"),
         ("run --store file/s.sqlite", "store = 'file/s.sqlite': must be in a folder that can be written"),
+        ("run --store .", "store = '.': must be a file, not a folder"),
+        ("run --store=", "store = '': must be a file, not a folder"),
+        ("reproduce --store .", "store = '.': must be a file, not a folder"),
+        ("reproduce --report=", "report = '': must be in a folder that can be written"),
+        ("reproduce --report file", "report = 'file': must be in a folder that can be written"),
+        ("run --tensorboard=", "tensorboard = '': must be in a folder"),
+        ("run --json=", "json = '': must be a file that can be written"),
+        (f"run {LONG}", "environment = 'xx*...: must be one of"),
+        (f"run --store {LONG}", "store = 'xx*must be a file that can be written"),
+        (f"run --json {LONG}", "json = 'xx*File name too long"),
+        (f"run --log {LONG}", "log = 'xx*File name too long"),
+        (f"run --tensorboard {LONG}", "tensorboard = 'xx*File name too long"),
+        (f"doctor {LONG}", "log = 'xx*...: must be a file that ends in"),
+        (f"doctor {LONG}.csv", "log = 'xx*File name too long"),
+        (f"leaderboard --store {LONG}", "store = 'xx*...: must be a file that is there"),
+        (f"leaderboard --out {LONG}", "store = 'results/uard.sqlite': must be a file that is there"),
+        (f"status --store {LONG}", "store = 'xx*there is no such file"),
+        (f"status {LONG}", "study = 'xx*...: must be one of"),
+        (f"compare {LONG} file", "store = 'xx*there is no such file"),
+        (f"migrate {LONG}", "path = '*...: must be"),
+        (f"reproduce control --extract {LONG}", "extract = 'xx*File name too long"),
+        (f"reproduce --report {LONG}", "report = 'xx*File name too long"),
+        (f"reproduce control --mitigation {LONG}", "mitigation = 'xx*...: must be one of"),
         ("reproduce nonsense", "study = 'nonsense': must be one of abstention, "),
         ("reproduce contrl", "study = 'contrl': must be one of *did you mean 'control'?"),
         ("reproduce control --seeds 1", "seeds = 1: must be a whole number in [2, "),
@@ -191,6 +225,32 @@ def test_silly_input_ends_the_real_program_with_2(arguments):
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ("run --seeds two", "'two' must be a whole number"),
+        ("run --seeds 1_0", "'1_0' must be a whole number"),
+        ("reproduce control --seeds 2.5", "'2.5' must be a whole number"),
+        ("run --noise much", "'much' must be a number"),
+        ("run --noise-fraction much", "'much' must be a number"),
+        ("run --steps many", "'many' must be a whole number"),
+    ],
+)
+def test_what_is_no_number_is_said_in_words(arguments, says, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(arguments.split())
+    assert stopped.value.code == 2
+    assert says in " ".join(re.sub("[│─╭╮╰╯]", " ", capsys.readouterr().err).split())
+
+
+@pytest.mark.parametrize("arguments", ["list", "run --help", "doctor CartPole-v1 --json -", "doctor CartPole-v1"])
+def test_a_reader_who_has_gone_is_no_accident(arguments, tmp_path):
+    """As in ``uard list | head -1``."""
+    command = f"{UARD} {arguments} | true; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", "")
 
 
 def test_a_run_that_diverges_ends_with_1(capsys):
@@ -291,14 +351,64 @@ def test_json_goes_where_it_is_told_and_replaces_no_device(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["link.json", "log.csv", "real.json"]
 
 
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A folder with a log and a store."""
+    folder = tmp_path_factory.mktemp("finished")
+    (folder / "log.csv").write_text("reward,rating_a,rating_b\n" + "".join(f"{i},{i},{i + 1}\n" for i in range(50)))
+    store = ["--seeds", "2", "--store", str(folder / "s.sqlite")]
+    cli.main(["reproduce", "control", *store, "--workers", "1", "--extract", str(folder / "extract.json")])
+    return folder
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "doctor log.csv --json",
+        "run --set size=5 --episodes 20 --seeds 1 --json",
+        "best-of-n --seeds 2 --json",
+        "status --store s.sqlite --json",
+        "compare s.sqlite s.sqlite --json",
+        "reproduce control --seeds 2 --store s.sqlite --extract",
+        "leaderboard --store s.sqlite --out",
+    ],
+)
+def test_every_output_goes_through_pipes_and_links_and_replaces_no_device(command, finished, tmp_path, monkeypatch):
+    monkeypatch.chdir(finished)
+    (tmp_path / "real").write_text("old")
+    (tmp_path / "link").symlink_to("real")
+    os.mkfifo(tmp_path / "fifo")
+    got = []
+    reader = threading.Thread(target=lambda: got.append((tmp_path / "fifo").read_text()), daemon=True)
+    reader.start()
+    for name in ("fifo", "link"):
+        cli.main([*command.split(), str(tmp_path / name)])
+    reader.join(10)
+    assert (tmp_path / "fifo").is_fifo()
+    assert (tmp_path / "link").is_symlink()
+    written = (tmp_path / "real").read_text()
+    assert written.startswith(("{", "<!doctype html>"))
+    assert len(got[0]) == pytest.approx(len(written), rel=0.1), "but for times"
+    with suppress(PermissionError):  # only root may make one
+        os.mknod(tmp_path / "null", 0o666 | stat.S_IFCHR, os.makedev(1, 3))
+        cli.main([*command.split(), str(tmp_path / "null")])
+        assert (tmp_path / "null").is_char_device()
+    assert {p.name for p in tmp_path.iterdir()} - {"null"} == {"fifo", "link", "real"}
+
+
 def test_what_others_wrote_is_printed_as_it_is(capsys):
     terminal.table(["[b]a[/b]", "b"], [["x[/red]", "\x1b[31mred"], ["\r\x07", "y"]], "a [title]", marked=(1,))
     terminal.glossary("t[/]", {"[name]": "\x9b0m [/text]"})
     terminal.warning(Console(highlight=False), "[bold]no[/bold]\x1b]0;title\x07")
+    terminal.say(Console(highlight=False), "a\u202eb\udcff\u2028")
+    terminal.table(["n\x1b"], [[f"{i}\r"] for i in range(600)], "many\x07")
     out = capsys.readouterr().out
     for text in ("[b]a[/b]", "x[/red]", r"\x1b[31mred", r"\r\x07", "a [title]", "t[/]", "[name]", r"\x9b0m [/text]"):
         assert text in out
     assert r"warning: [bold]no[/bold]\x1b]0;title\x07" in out
+    assert r"a\u202eb\udcff\u2028" in out
+    assert "many\\x07\nn\\x1b\n0\\r\n1\\r\n" in out
+    assert not re.search("[\x00-\x09\x0b-\x1f\x7f-\x9f\u202e]", out)
 
 
 def test_an_interrupt_is_no_accident(tmp_path):

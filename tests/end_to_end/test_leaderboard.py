@@ -1,6 +1,8 @@
 import json
 import re
 import sqlite3
+from contextlib import closing
+from dataclasses import dataclass
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -17,7 +19,7 @@ from uard.lab.execution import runner
 from uard.lab.execution.store import Store
 from uard.lab.views import leaderboard
 from uard.lab.views.leaderboard import Estimate, Line, lines, standings
-from uard.method.mitigations import named
+from uard.method.mitigations import Raw, named
 from uard.ratings.panels import PANELS, as_panel
 
 GRID = TrapGrid(size=4, traps=((1, 2),), horizon=12)
@@ -86,6 +88,25 @@ def opened(board, browser):
     for page in pages:
         page.close()
     assert wrong == []
+
+
+@dataclass(frozen=True)
+class Noted(Raw):
+    note: str = ""
+
+
+def test_text_of_others_is_shown_and_never_obeyed(browser, tmp_path):
+    hostile = "<img src=x onerror='window.hacked=1'><script>window.hacked=1</script>"
+    with closing(Store(tmp_path / "s.sqlite")) as store:
+        runner.run([(Cell(GRID, Noted(note), episodes=5), 0) for note in (hostile, "plain")], store, workers=1)
+        leaderboard.write(tmp_path / "page.html", store)
+    page = browser.new_page()
+    page.goto((tmp_path / "page.html").as_uri())
+    assert any("<script>window.hacked=1</script>" in text for text in column(page, "mitigation"))
+    assert page.locator("img").count() == 0
+    assert page.evaluate("window.hacked ?? null") is None
+    assert "default-src 'none'" in page.locator("meta[http-equiv='Content-Security-Policy']").get_attribute("content")
+    page.close()
 
 
 def column(page, name, table="table.lines"):

@@ -30,6 +30,9 @@ pytestmark = pytest.mark.slow
 EXAMPLE = Path(__file__).parents[2] / "examples" / "uard-plugin-example"
 BROKEN = """
 from dataclasses import dataclass
+from uard.agents.base import Agent
+from uard.envs.base import Environment
+from uard.envs.grids.trapgrid import TrapGrid
 from uard.method.mitigations import Mitigation, Raw
 
 @dataclass(frozen=True)
@@ -54,6 +57,37 @@ class Command:
 
 def quits():
     raise SystemExit(0)
+
+@dataclass(frozen=True)
+class Quits(Raw):
+    now: bool = False
+
+    def __post_init__(self):
+        if self.now:
+            raise SystemExit(0)
+
+@dataclass(frozen=True)
+class Old(Mitigation):
+    def signal(self, reward, sigma_m, feedback):
+        return reward
+
+@dataclass(frozen=True)
+class Kindless(Environment):
+    horizon: int = 5
+
+@dataclass(frozen=True)
+class Unfamiliar(Agent):
+    pass
+
+@dataclass(frozen=True)
+class Trapdoor(TrapGrid):
+    def task(self, *_):
+        raise SystemExit(0)
+
+def trapdoor():
+    from uard.lab.cell import Cell
+    from uard.lab.study import Study, row
+    return {"doors": (Study("trapdoor", "t", "a", (row(Cell(Trapdoor(3), episodes=5), a=1),)),)}
 
 def taken():
     return {"mine": (study("control"),)}
@@ -83,11 +117,15 @@ missing = uard_broken:Nothing
 three = uard_broken:three
 raises = uard_broken:raises
 thawed = uard_broken:Thawed
+old = uard_broken:Old
+exits = uard_broken:quits
 raw = uard_broken:Mine
 twice = uard_broken:Mine
 [uard.environments]
 nowhere = uard_broken:Mine
+kindless = uard_broken:Kindless
 [uard.agents]
+unfamiliar = uard_broken:Unfamiliar
 sac = uard_broken:Mine
 [uard.commands]
 run = uard_broken:Command
@@ -163,10 +201,11 @@ def test_broken_ones_are_told_and_disturb_nobody(broken, capsys):
     assert names_ >= {"ceiling", "BellCorridor", "softmax-dqn", *mitigation.NAMED}
     warnings = [line.removeprefix("warning: ") for line in err.splitlines()]
     assert sorted(w.split(": must be usable")[0] for w in warnings) == [
-        "agent = 'sac'",
+        *(f"agent = {name!r}" for name in ("sac", "unfamiliar")),
         *(f"command = {name!r}" for name in ("lost", "run", "thaw")),
-        "environment = 'nowhere'",
-        *(f"mitigation = {n!r}" for n in ("gone", "missing", "raises", "raw", "thawed", "three", "twice", "twice")),
+        *(f"environment = {name!r}" for name in ("kindless", "nowhere")),
+        *(f"mitigation = {name!r}" for name in ("exits", "gone", "missing", "old", "raises", "raw")),
+        *(f"mitigation = {name!r}" for name in ("thawed", "three", "twice", "twice")),
         "report = 'gone'",
         "results = 'odd'",
         *(f"studies = {name!r}" for name in ("absent", "control", "group", "mine", "quits", "twice")),
@@ -178,6 +217,9 @@ def test_broken_ones_are_told_and_disturb_nobody(broken, capsys):
         "AttributeError: module 'uard_broken' has no attribute 'Nothing'",
         "ModuleNotFoundError: No module named 'no_such_module'",
         "SystemExit: 0",
+        "what it gives, Kindless(horizon=5), must be an Environment that declares its kind: tables, world, simulator",
+        "what it gives, Unfamiliar(), must be an Agent that declares its family: tabular, replay, rollout",
+        "what it gives, Old(), must be a Mitigation whose signal can be called as every mitigation's is: signal(evi",
         "3 is no dictionary of groups, (Study, ...) by name",
         "the name of its study 'control' is taken",
         "the name of its group 'matrix' is that of a study",
@@ -192,9 +234,11 @@ def test_broken_ones_are_told_and_disturb_nobody(broken, capsys):
     [
         ("gone", "entry point gone = no_such_module:Thing of package broken 1.0: ModuleNotFoundError: No module named"),
         ("missing", "entry point missing = .* of package broken 1.0: AttributeError: .*Nothing"),
-        ("three", "3 is no frozen dataclass that is a mitigation"),
+        ("three", "what it gives, 3, must be a frozen dataclass that is a Mitigation"),
         ("raises", "RuntimeError: not today"),
-        ("thawed", "is no frozen dataclass that is a mitigation"),
+        ("exits", "SystemExit: 0"),
+        ("old", "what it gives, .*, must be a Mitigation whose signal can be called"),
+        ("thawed", "what it gives, .*Thawed.*, must be a frozen dataclass that is a Mitigation"),
         ("twice", "the name is also brought by other 1.0"),
     ],
 )
@@ -203,8 +247,43 @@ def test_a_broken_one_says_why_when_it_is_asked_for(broken, name, why):
         named(name)
 
 
+def test_a_package_that_calls_sys_exit_never_ends_a_command_as_if_all_were_done(installed, tmp_path):
+    """Wherever it does so; in the real program, whose exit code counts."""
+    (tmp_path / "uard_broken.py").write_text(BROKEN)
+    entries = """
+[uard.mitigations]
+quits = uard_broken:Quits
+[uard.studies]
+trapdoor = uard_broken:trapdoor
+"""
+    distribution(tmp_path, "broken", entries)
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    uard = Path(sys.executable).parent / "uard"
+    for command, says in (
+        ("run --mitigation quits --set-mitigation now=true --seeds 1", "uard_broken.py, line"),
+        ("reproduce trapdoor --seeds 2 --workers 1", ""),
+        ("reproduce trapdoor --seeds 2 --workers 2", ""),
+    ):
+        done = subprocess.run(
+            [uard, *command.split()],
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": path},
+        )
+        assert (done.returncode, done.stdout) == (1, ""), done.stderr
+        assert "error: " in done.stderr
+        assert says in done.stderr
+        assert "Traceback" not in done.stderr.partition("failed: ")[2]
+
+
+def test_our_own_names_are_no_plugins(example):
+    with pytest.raises(UnknownNameError, match="mitigation = 'raw'"):
+        plugins.pick("mitigation", "raw", mitigation.NAMED, [*mitigation.NAMED])
+
+
 def test_what_is_of_another_kind_or_has_our_name_is_not_taken(broken):
-    with pytest.raises(PluginError, match=r"Mine\(\) is no frozen dataclass that is an environment"):
+    with pytest.raises(PluginError, match=r"Mine\(\), must be a frozen dataclass that is an Environment"):
         names.environment("nowhere", {})
     assert type(named("raw")) is Raw
     assert names.agent("sac", {}) == names.AGENTS["sac"]
@@ -367,6 +446,8 @@ def test_sections_of_packages_join_the_report(broken, tmp_path):
     [
         ({"id": "Two words"}, "id = 'Two words': must be small letters"),
         ({"order": float("nan")}, "order = nan: must be a finite number"),
+        ({"js": "'</SCRIPT>'"}, "js = \"'</SCRIPT>'\": must be without </script>"),
+        ({"css": "</style>"}, "css = '</style>': must be without </style>"),
         ({"files": {"../up": ""}}, "files = '../up': must be a plain name"),
         ({"files": {"index.html": ""}}, "files = 'index.html': must be a plain name, none of index.html"),
     ],

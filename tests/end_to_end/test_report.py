@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from uard.lab.views import sections, templates
 from uard.replication.ledger import VERDICTS
 
 pytestmark = pytest.mark.slow
@@ -180,6 +181,39 @@ def test_the_ledger_can_be_filtered(page, made):
         assert pressed == [verdict or "all"]
     for verdict in VERDICTS:
         assert f"{verdicts.count(verdict)} {verdict}" in page.locator("#short ~ p").nth(1).inner_text()
+
+
+HOSTILE = """
+<script>window.hacked = "script"</script>
+<img id="picture" src="x" onerror="window.hacked = 'onerror'">
+<a id="link" href="javascript:window.hacked = 'link'">link</a>
+<button id="button" onclick="window.hacked = 'onclick'" style="position: fixed">button</button>
+<style>h2 { color: red }</style>
+<script src="data:text/javascript,window.hacked='source'"></script>
+<iframe srcdoc="<script>parent.hacked = 'frame'</script>"></iframe>
+<svg onload="window.hacked = 'svg'"></svg>
+"""
+
+
+def test_what_a_text_brings_onto_the_page_does_not_run_and_our_programs_do(browser, tmp_path):
+    mine = sections.Section(
+        "mine", "<b>T</b>", 1, HOSTILE, css="h2 { color: rgb(1, 2, 3) }", js="window.ours = 'ä < 1'"
+    )
+    other = sections.Section("other", "Other", 2, "", js="window.more = window.ours + '!'")
+    programs = [f"{{\n{s.js}\n}}" for s in (mine, other)]
+    values = {"version": "1", "seeds": 2, "window": 100, "links": [], "programs": programs}
+    text = templates.render(templates.HERE, "page.html.j2", sections=[mine, other], **values)
+    (tmp_path / "page.html").write_text(text, encoding="utf-8")
+    page = browser.new_page()
+    page.goto((tmp_path / "page.html").as_uri())
+    for place in ("#link", "#button"):
+        page.locator(place).click()
+    page.wait_for_timeout(200)
+    assert page.evaluate("[window.hacked ?? null, window.ours, window.more]") == [None, "ä < 1", "ä < 1!"]
+    assert page.evaluate("getComputedStyle(document.querySelector('h2')).color") == "rgb(1, 2, 3)"
+    assert page.evaluate("getComputedStyle(document.querySelector('#button')).position") == "static"
+    assert page.locator("h2").first.inner_text() == "<b>T</b>"
+    page.close()
 
 
 def test_nothing_sticks_out_on_a_telephone(page):

@@ -8,6 +8,7 @@ import pkgutil
 import subprocess
 import sys
 import typing
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -24,7 +25,10 @@ from uard.envs.base import Environment
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.cell import Cell
 from uard.lab.config import FORMAT, key_of, plain, type_name
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store
 from uard.lab.registry import AGENTS, CONTINUOUS, ENVIRONMENTS
+from uard.lab.result import Result
 from uard.lab.trainers import TRAINERS
 from uard.method.abstention import Abstention
 from uard.method.mitigations import RatedReward, Raw, Screening, named
@@ -131,6 +135,33 @@ class Misnamed(Mitigation):
         return LearningSignal(evidence.reward, 1.0)
 
 
+@dataclass(frozen=True)
+class Typed(Mitigation):
+    on: bool = True
+    count: int = 1
+    size: "float | None" = None
+    name: str = "x"
+
+    def signal(self, evidence, statistics):
+        return LearningSignal(evidence.reward, 1.0)
+
+
+@dataclass(frozen=True)
+class OldSignature(Mitigation):
+    def signal(self, reward, sigma_m, feedback):
+        return LearningSignal(reward, 1.0)
+
+
+@dataclass(frozen=True)
+class NoKind(Environment):
+    horizon: int = 5
+
+
+@dataclass(frozen=True)
+class NoFamily(Agent):
+    pass
+
+
 class Bare(Mitigation):
     def signal(self, evidence, usual):
         return LearningSignal(evidence.reward, 1.0)
@@ -179,6 +210,10 @@ def test_the_key_depends_on_the_classes():
             Cell(mitigation=named("uard"), noise=1, rated=np.float32(0.5)),
             Cell(mitigation=named("uard"), noise=1.0, rated=0.5),
         ),
+        (
+            Cell(mitigation=Typed(np.True_, np.int64(1), 1, np.str_("x"))),
+            Cell(mitigation=Typed(True, 1, np.float32(1.0), "x")),
+        ),
         (Cell(mitigation=Own(k=np.float64(2), parts=(np.int64(1), 0.0))), Cell(mitigation=Own(k=2, parts=(1, -0.0)))),
     ],
 )
@@ -197,7 +232,7 @@ def test_what_the_raters_do_does_not_matter_to_a_mitigation_that_asks_nobody(cha
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"panel": "main"}, r"^panel = 'main': must be a frozen dataclass that is a Panel \(see uard\.ratings\.panels"),
+        ({"panel": "main"}, r"^panel = 'main': must be .* a Panel, such as uard\.ratings\.panels\.PANELS\['main'\]$"),
         ({"panel": None}, "^panel = None"),
         ({"noise": -1}, r"^noise = -1: must be a finite number >= 0"),
         ({"noise": math.nan}, r"^noise = nan"),
@@ -213,9 +248,27 @@ def test_what_the_raters_do_does_not_matter_to_a_mitigation_that_asks_nobody(cha
         ({"snapshots": -1}, "^snapshots = -1"),
         ({"environment": 6}, "^environment = 6: must be a frozen dataclass that is an Environment"),
         ({"agent": "q-learning"}, "^agent = 'q-learning': must be a frozen dataclass that is an Agent"),
-        ({"mitigation": "uard"}, "^mitigation = 'uard': must be a frozen dataclass that is a Mitigation"),
+        (
+            {"mitigation": "uard"},
+            r"^mitigation = 'uard': must be .*, such as uard\.method\.mitigations\.named\('",
+        ),
         ({"mitigation": None}, "^mitigation = None"),
-        ({"mitigation": Raw}, "^mitigation = <class .*Raw'>"),
+        (
+            {"mitigation": Raw},
+            r"^mitigation = <class .*Raw'>: must be .*this is a class: Raw\(\.\.\.\) makes one",
+        ),
+        (
+            {"mitigation": OldSignature()},
+            r"^mitigation = .*must be a Mitigation whose signal can be .*: signal\(evi",
+        ),
+        ({"environment": NoKind()}, r"^environment = .*must be an Environment that declares its kind: tables, world, "),
+        ({"agent": NoFamily()}, r"^agent = .*must be an Agent that declares its family: tabular, replay"),
+        ({"feedback": None}, "^feedback = None: must be left out: the field is called rating_model now"),
+        ({"mitigation": Typed(on=1)}, r"^mitigation\.on = 1: must be true or false"),
+        ({"mitigation": Typed(count=1.0)}, r"^mitigation\.count = 1\.0: must be a whole number"),
+        ({"mitigation": Typed(count=True)}, r"^mitigation\.count = True: must be a whole number"),
+        ({"mitigation": Typed(size=True)}, r"^mitigation\.size = True: must be a finite number"),
+        ({"mitigation": Typed(name=1)}, r"^mitigation\.name = 1: must be a text"),
         ({"mitigation": Bare()}, "^mitigation = .*Bare.*: must be a frozen dataclass"),
         ({"mitigation": Thawed()}, "^mitigation = .*Thawed.*: must be a frozen dataclass"),
         ({"mitigation": Own(k=math.nan)}, r"^mitigation\.k = nan: must be a finite number"),
@@ -229,6 +282,26 @@ def test_what_the_raters_do_does_not_matter_to_a_mitigation_that_asks_nobody(cha
 def test_errors_name_the_field(changes, message):
     with pytest.raises(InvalidValueError, match=message):
         Cell(**changes)
+
+
+def test_classes_that_are_local_to_a_function_are_told_apart_and_kept_in_no_file(tmp_path):
+    def local():
+        @dataclass(frozen=True)
+        class Mine(Raw):
+            pass
+
+        return Mine
+
+    one, other = local(), local()
+    assert Cell(mitigation=one()).key == Cell(mitigation=one()).key != Cell(mitigation=other()).key
+    with closing(Store(tmp_path / "s.sqlite")) as store:
+        with pytest.raises(InvalidValueError, match=r"class = '.*<locals>\.Mine': must be a class outside functions"):
+            runner.run([(Cell(mitigation=one()), 0)], store)
+        with pytest.raises(InvalidValueError, match="class = "):
+            store.put([(Cell(mitigation=one()), 0, Result(np.ones((1, 6)), 1, np.zeros(1), {}))])
+        assert store.count() == (0, 0)
+    with closing(Store(":memory:")) as store:
+        assert runner.run([(Cell(TrapGrid(3), mitigation=m(), episodes=5), 0) for m in (one, other)], store, 1) == 2
 
 
 def test_changing_a_cell_checks_it_again():

@@ -9,7 +9,7 @@ from uard.lab import statistics
 from uard.lab.statistics import Summary
 from uard.lab.studies import every
 from uard.lab.views import published
-from uard.replication import ledger
+from uard.replication import command, ledger
 from uard.replication.ledger import words
 from uard.replication.ledger.entries import CONDITIONS, entry
 from uard.replication.paper import Stat
@@ -225,10 +225,13 @@ def test_without_published_results_a_claim_cannot_be_tested(claim, monkeypatch):
 
 
 def test_the_terminal_and_the_data_show_parts_counts_and_opinions(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("COLUMNS", "80")
     made = [entry(claim, NUMBERS[claim]) for claim in ("J12", "J35")]
-    ledger.to_rich(made)
-    shown = " ".join(capsys.readouterr().out.split())
+    command.show(made)
+    out = capsys.readouterr().out
+    shown = " ".join(out.split())
+    assert max(map(len, out.splitlines())) <= 80
+    assert all(e.statement in shown and e.why in shown for e in made), "nothing is cut"
     assert "1 of 3" in shown
     assert "(opinion)" in shown
     data = json.loads(json.dumps(ledger.as_data(made, range(2)), allow_nan=False))

@@ -67,7 +67,7 @@ def write(path: str | Path, text: str, field: str) -> None:
     """Write text as UTF-8, as ``replacing`` does.
 
     Args:
-        path: Its folder is made.
+        path: Its folder is made, and those that it is in.
         text: The whole content.
         field: What the path is called in the error.
 
@@ -77,7 +77,7 @@ def write(path: str | Path, text: str, field: str) -> None:
     try:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as file:
-            file.write(text.encode())
+            file.write(text.encode(errors="backslashreplace"))  # half a surrogate pair has no UTF-8
     except OSError as error:
         raise InvalidValueError(field, str(path), f"a file that can be written ({error})") from None
 
@@ -109,7 +109,7 @@ def prepare(path: str | Path, field: str) -> None:
 
 
 def prepare_folder(path: str | Path, field: str) -> None:
-    """Make a folder and refuse one into which nothing can be written.
+    """Make a folder, and those that it is in, and refuse one into which nothing can be written.
 
     Raises:
         InvalidValueError: naming ``field`` and the path.
@@ -119,6 +119,8 @@ def prepare_folder(path: str | Path, field: str) -> None:
 
 def _prepare_folder(folder: str | Path, path: str, field: str) -> None:
     try:
+        if not os.fspath(folder):
+            raise FileNotFoundError(errno.ENOENT, "an empty name")
         Path(folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidValueError(field, path, f"in a folder that can be written ({error})") from None

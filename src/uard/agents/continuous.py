@@ -23,6 +23,7 @@ import optax
 from jax import Array, lax
 
 from uard import _checks
+from uard._support import fields
 from uard.agents import networks
 from uard.agents.actor_critic import LOG_TEMPERATURES, Trained, gradient_similarity, polyak, temperature_loss
 from uard.agents.base import Agent, Family
@@ -93,6 +94,7 @@ class ContinuousActorCritic(Agent):
         Raises:
             InvalidValueError: naming the field, the value and what is allowed.
         """
+        fields.check(self)
         _checks.number("gamma", self.gamma, low=0, high=0.9999)
         _checks.number("entropy", self.entropy, low=-100, high=100)
         _checks.number("temperature", self.temperature, low=0, high=math.exp(LOG_TEMPERATURES[1]), open_low=True)

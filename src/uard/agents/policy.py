@@ -22,6 +22,7 @@ from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 
 from uard import _checks
+from uard._support import fields
 from uard.agents import heads, networks
 from uard.agents.base import Agent, Family
 from uard.agents.heads import ActionDistribution, divergence, entropy, log_probability
@@ -426,6 +427,7 @@ class CPO(TrustRegion):
             InvalidValueError: naming the field, the value and what is allowed.
         """
         super().__post_init__()
+        fields.check(self)
         _checks.number("limit", self.limit, low=0)
 
     @property

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import traceback
+from collections.abc import Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Any, Union
 
-from uard import __version__, _checks
+from uard import __version__
+from uard._support import signals
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -18,25 +20,47 @@ if TYPE_CHECKING:
 _OF_LAB = ("jax", "jaxlib", "optax", "scipy", "tyro", "rich", "matplotlib", "jinja2")
 
 
-class _TerminatedError(KeyboardInterrupt):
-    """SIGTERM, which ends a study as an interrupt does."""
-
-
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line.
 
-    Exit code 2 for bad input, 1 for failed runs, a danger or a difference, 130 for an interrupt, 143 for SIGTERM.
+    Exit code 2 for bad input, 1 for failed runs, a danger, a difference or a closed output, 130 for SIGINT, 143 for
+    SIGTERM.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments in (["--version"], ["-V"]):
         print(f"uard {__version__}")
         return
     try:
-        _run(arguments)
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] not in _OF_LAB:
+        with signals.ending():
+            _run(arguments)
+            sys.stdout.flush()
+    except BaseException as error:
+        if signals.received() is None and not isinstance(error, KeyboardInterrupt):
+            _end(error)
             raise
+        _stop()
+    if signals.received() is not None:  # and its exception was swallowed
+        _stop()
+
+
+def _end(error: BaseException) -> None:
+    """End the program in some words if they explain the error."""
+    if isinstance(error, BrokenPipeError):
+        signals.quiet_output()
+        sys.exit(1)
+    if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] in _OF_LAB:
         sys.exit(f"the laboratory is not installed: pip install 'uard[lab]' ({error})")
+
+
+def _stop() -> None:
+    """Say that a signal has ended the program, whatever it has disturbed on its way, and end with its exit code."""
+    number = signals.received() or signal.SIGINT
+    stored = "; every finished cell is stored, the same command goes on from there"
+    with suppress(OSError):  # of a terminal that is gone
+        print(signals.WORDS[number] + stored * ("uard.lab.execution.store" in sys.modules), file=sys.stderr, flush=True)
+    if signals.received() is None:
+        sys.exit(128 + number)
+    signals.end()
 
 
 def _run(arguments: list[str]) -> None:
@@ -47,22 +71,24 @@ def _run(arguments: list[str]) -> None:
     console = Console(stderr=True, highlight=False)
     command = _parsed(arguments, console)
     try:
-        with _terminable():
-            command.run(console)
+        command.run(console)
     except _of_users() as error:
         terminal.error(console, str(error))
         sys.exit(2)
-    except KeyboardInterrupt as stop:
-        what, code = ("terminated", 143) if isinstance(stop, _TerminatedError) else ("interrupted", 130)
-        terminal.say(console, f"{what}; every finished cell is stored, the same command goes on from there")
-        sys.exit(code)
+    except SystemExit as end:
+        if end.code in (None, 0) and type(command).__module__.startswith("uard."):  # which none of ours does
+            where = traceback.extract_tb(end.__traceback__)[-1]
+            why = f"{where.filename}, line {where.lineno}, tried to end the program as if all were done"
+            terminal.error(console, f"{why}: a package must not call sys.exit")
+            sys.exit(1)
+        raise
 
 
 def _parsed(arguments: list[str], console: Console) -> Command:
     """Return the command with its options; those of packages are imported only if none of ours is named."""
     import tyro
 
-    from uard.cli import terminal
+    from uard.cli import settings, terminal
     from uard.cli.commands import brought, own
 
     commands = own()
@@ -73,25 +99,13 @@ def _parsed(arguments: list[str], console: Console) -> Command:
         commands = commands | {plugin.name: command for plugin, command in theirs.items()}
     kinds = tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in commands.items())
     union: Any = Union[kinds]  # noqa: UP007 (of as many as there are)
-    return tyro.cli(union, prog="uard", args=arguments, description="Rewards that cannot be fully trusted.")
+    text = "Rewards that cannot be fully trusted."
+    return tyro.cli(union, prog="uard", args=arguments, description=text, registry=settings.numbers())
 
 
 def _of_users() -> tuple[type[Exception], ...]:
     """Return the errors that their message explains. A module that nobody has imported has raised none."""
+    from uard import _checks
+
     names = (("uard.lab.execution.store", "StoreError"), ("uard.lab.execution.cluster", "ClusterError"))
     return (_checks.InvalidValueError, *(getattr(sys.modules[m], name) for m, name in names if m in sys.modules))
-
-
-@contextmanager
-def _terminable() -> Iterator[None]:
-    """Let SIGTERM end the block as an interrupt does, once; a second one would only disturb the ending."""
-
-    def stop(number: int, _: object) -> None:
-        signal.signal(number, signal.SIG_IGN)
-        raise _TerminatedError
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

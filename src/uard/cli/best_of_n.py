@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from uard import __version__, _checks
+from uard._support.text import counted, printable
 from uard.cli import progress, terminal
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ class BestOfN:
 
         _checks.whole("seeds", self.seeds, low=2, high=100_000)
         terminal.check_json(self.json)
-        with progress.spinner(console, f"choosing the best of n, {self.seeds} seeds"):
+        with progress.spinner(console, f"choosing the best of n, {counted(self.seeds, 'seed')}"):
             result = best_of_n.run(range(self.seeds))
         data = {"command": f"uard best-of-n --seeds {self.seeds}", "version": __version__} | result.as_data()
         if self.json is not None:
@@ -36,4 +37,4 @@ class BestOfN:
         if self.json != "-":
             terminal.show(shown.table(data))
             for loss in shown.losses(data):
-                print(loss)
+                print(printable(loss))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
+from uard._support.text import counted
 from uard.cli import terminal
 from uard.cli.terminal import MANY
 
@@ -69,6 +70,8 @@ def _print(found: Comparison) -> None:
         marked = {i for i, (_, _, e) in enumerate(shown) if e.differs}
         terminal.table(columns, rows, marked=marked, out=out)
         if len(differing) > MANY:
-            terminal.say(out, f"and {len(differing) - MANY} cells more that differ; --json has them all")
+            terminal.say(
+                out, f"and {counted(len(differing) - MANY, 'more cell')} with differences; --json has them all"
+            )
     for line in compare.lines(found):
         terminal.say(out, line)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from uard import InvalidValueError, __version__
+from uard._support.text import printable
 from uard.cli import terminal
 from uard.cli.settings import Pairs
 from uard.cli.settings import mitigation as mitigation_named
@@ -62,7 +64,7 @@ class Doctor:
         if self.json is not None:
             terminal.write_json({"version": __version__} | found.as_data(), self.json)
         if self.json != "-":
-            print(found)
+            print(printable(str(found)))
         if found.count("danger") or (self.strict and found.count("warning")):
             sys.exit(1)
 
@@ -70,7 +72,7 @@ class Doctor:
         """Return the log: of a file if it looks like one, else of an environment."""
         from uard.ratings import readers, rollout
 
-        if Path(self.log).suffix.lower() in readers.FORMATS or Path(self.log).exists():
+        if Path(self.log).suffix.lower() in readers.FORMATS or os.path.exists(self.log):  # Path's raises
             return readers.read(self.log, self.reward, self.ratings or None)
         import gymnasium
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +32,7 @@ class Leaderboard:
         from uard.lab.views import leaderboard
         from uard.lab.views.status import said_of_damaged
 
-        if not Path(self.store).is_file():
+        if not os.path.isfile(self.store):  # Path's raises for a long name
             allowed = "a file that is there; `uard reproduce` and `uard run --store` make one"
             raise InvalidValueError("store", self.store, allowed)
         files.prepare(self.out, "out")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from uard._support.text import counted
 from uard.cli import terminal
 
 if TYPE_CHECKING:
@@ -34,7 +35,9 @@ class List:
             "mitigations": {k: str(mitigations.named(k)) for k in mitigations.NAMED} | theirs["mitigation"],
             "panels": {k: str(v) for k, v in PANELS.items()},
             **{
-                f"studies of {group}": {s.name: f"{s.title} ({s.answers}; {len(s.rows)} cells)" for s in members}
+                f"studies of {group}": {
+                    s.name: f"{s.title} ({s.answers}; {counted(len(s.rows), 'cell')})" for s in members
+                }
                 for group, members in studies.groups().items()
             },
         }

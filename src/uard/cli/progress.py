@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from uard.cli.terminal import escape
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -29,11 +31,11 @@ def bar(console: Console, what: str) -> Iterator[Callable[[int, int, float | Non
         TextColumn("{task.fields[left]}"),
     )
     with Progress(*columns, console=console) as shown:
-        task = shown.add_task(what, total=None, left="")
+        task = shown.add_task(escape(what), total=None, left="", visible=False)  # perhaps there is nothing to do
 
         def move(done: int, total: int, seconds: float | None) -> None:
             left = "" if seconds is None else f"about {duration(seconds)} left" if done < total else "done"
-            shown.update(task, completed=done, total=total, left=left)
+            shown.update(task, completed=done, total=total, left=left, visible=True)
 
         yield move
 
@@ -41,5 +43,5 @@ def bar(console: Console, what: str) -> Iterator[Callable[[int, int, float | Non
 @contextmanager
 def spinner(console: Console, what: str) -> Iterator[None]:
     """Show that something of unknown length is going on while the block runs."""
-    with console.status(what):
+    with console.status(escape(what)):
         yield

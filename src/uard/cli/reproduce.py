@@ -10,6 +10,7 @@ from tyro.conf import Positional
 
 from uard import InvalidValueError, _checks
 from uard._support import files
+from uard._support.text import counted
 from uard.cli import progress, terminal, training
 from uard.cli.list import broken
 from uard.cli.settings import Names
@@ -74,7 +75,7 @@ class Reproduce:
 
             line = f"uard reproduce {' '.join(self.studies)} --seeds {self.seeds}"
             terminal.write_json(published.extract(chosen, store, seeds, line), self.extract, "extract", indent=None)
-        if self.report:
+        if self.report is not None:
             from uard.lab.views import page
 
             with progress.spinner(console, "writing the report"):
@@ -107,9 +108,9 @@ class Reproduce:
         """Refuse before training, not after it, what cannot be written."""
         from uard.lab import studies
 
-        if self.report and {s.name for s in chosen} < {s.name for s in studies.grid()}:
+        if self.report is not None and {s.name for s in chosen} < {s.name for s in studies.grid()}:
             raise InvalidValueError("report", self.report, "left out unless all grid studies are run")
-        if self.report:
+        if self.report is not None:
             files.prepare_folder(self.report, "report")
         terminal.check_json(self.extract, "extract")
         for name, given in (("report", self.report), ("extract", self.extract)):
@@ -126,7 +127,7 @@ class Reproduce:
             jobs,
             store,
             console,
-            f"{len(chosen)} studies, {len(jobs)} runs",
+            f"{counted(len(chosen), 'study', 'studies')}, {counted(len(jobs), 'run')}",
             self.watch,
             workers=self.workers,
             studies=chosen,
@@ -134,4 +135,6 @@ class Reproduce:
             again=f"only these again: uard reproduce {names}--seeds {self.seeds} --store {self.store} --failed\n"
             f"their tracebacks: uard status {names}--store {self.store} --errors",
         )
-        terminal.say(console, f"{trained} runs trained, {len(jobs) - trained} were in {self.store} already")
+        before = len(jobs) - trained
+        there = f"{before} {'was' if before == 1 else 'were'} in {self.store} already"
+        terminal.say(console, f"{counted(trained, 'run')} trained, {there}")

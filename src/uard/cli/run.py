@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from uard import __version__, _checks
+from uard._support.text import counted
 from uard.cli import settings, terminal, training
 from uard.cli.settings import Pairs
 from uard.cli.training import UNWATCHED, WatchOptions
@@ -73,11 +74,11 @@ class Run:
         _checks.whole("seeds", self.seeds, low=1, high=100_000)
         terminal.check_json(self.json)
         cell, trap_reward = self._cell()
-        store = Store(self.store or ":memory:")
+        store = Store(":memory:" if self.store is None else self.store)
         seeds = range(self.seeds)
         started = time.perf_counter()
         jobs = [(cell, s) for s in seeds]
-        trained = training.train(jobs, store, console, f"training {len(seeds)} seeds", self.watch)
+        trained = training.train(jobs, store, console, f"training {counted(len(seeds), 'seed')}", self.watch)
         seconds = time.perf_counter() - started
         results = results_of(cell, store, seeds)
         metrics = summaries(results)
@@ -133,7 +134,7 @@ class Run:
         return self.noise_fraction * abs(trap_reward)
 
     def _print(self, metrics: dict[str, Any]) -> None:
-        title = f"{self.environment} / {self.agent} / {self.mitigation} / {self.panel}, {self.seeds} seeds"
+        title = f"{self.environment} / {self.agent} / {self.mitigation} / {self.panel}, {counted(self.seeds, 'seed')}"
         rows = [
             (
                 name.replace("_", " "),

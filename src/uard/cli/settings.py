@@ -7,6 +7,7 @@ import json
 from typing import Annotated, Any
 
 from tyro.conf import UseAppendAction, arg
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from uard import _checks
 from uard._support.fields import changed
@@ -16,20 +17,48 @@ Pairs = Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=VALUE")]
 Names = Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")]
 
 
+def numbers() -> ConstructorRegistry:
+    """Return how options that are numbers are read, with errors in words: ``1_000`` and ``two`` are none."""
+    registry = ConstructorRegistry()
+
+    @registry.primitive_rule
+    def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+        if info.type not in (int, float):
+            return None
+        kind: Any = info.type
+        metavar, allowed = ("INT", "a whole number") if kind is int else ("FLOAT", "a number")
+
+        def read(texts: list[str]) -> Any:
+            try:
+                if "_" not in texts[0]:
+                    return kind(texts[0])
+            except ValueError:
+                pass
+            raise ValueError(f"{_checks.short(texts[0])} must be {allowed}")
+
+        return PrimitiveConstructorSpec(1, metavar, read, lambda value: isinstance(value, kind), lambda v: [str(v)])
+
+    return registry
+
+
 def settings(pairs: tuple[str, ...], option: str = "--set") -> dict[str, Any]:
     """Read ``name=value`` pairs; values are JSON, or else text.
 
     Raises:
-        InvalidValueError: a pair without ``=``.
+        InvalidValueError: a pair without ``=``, or a second value for a name.
     """
     out: dict[str, Any] = {}
     for pair in pairs:
         name, sign, value = pair.partition("=")
         if not sign or not name:
             raise _checks.InvalidValueError(option, pair, "name=value, such as size=12 or 'traps=[[2,5],[7,3]]'")
+        if name in out:
+            raise _checks.InvalidValueError(
+                option, pair, f"left out: {name} was set to {_checks.short(out[name])} before"
+            )
         try:
             out[name] = json.loads(value)
-        except json.JSONDecodeError:
+        except (ValueError, RecursionError):  # of a number of 5000 digits, too
             out[name] = value
     return out
 

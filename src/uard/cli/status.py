@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from uard import _checks
+from uard._support.text import counted
 from uard.cli import terminal
 from uard.cli.training import DEFAULT_STORE
 
@@ -54,7 +55,7 @@ class Status:
         from uard.lab.views import status
 
         out = terminal.output()
-        terminal.say(out, f"{self.store}: {found.cells} cells, {found.seeds} seeds")
+        terminal.say(out, f"{self.store}: {counted(found.cells, 'cell')}, {counted(found.seeds, 'seed')}")
         for line in (*status.said_of_damaged(found.damaged), *status.lines(found.runs)):
             terminal.say(out, line)
         columns = ("study", "seeds a cell", "finished", "in work", "failed", "missing", "last finished (UTC)")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from uard import _checks
 from uard._support import files
+from uard._support.text import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 MANY = 20  # lines of one kind, after which the rest is counted
 _PLAIN = 500  # rows from which on a table has plain columns: rich needs a second for a thousand rows
-_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 
 def output() -> Console:
@@ -49,10 +48,10 @@ def warning(console: Console, text: str) -> None:
 
 
 def escape(text: str) -> str:
-    """Return text that rich prints as it is: markup is shown, control characters are spelt out."""
+    """Return text that rich prints as it is: markup is shown, and the rest is ``printable``."""
     from rich.markup import escape as escaped
 
-    return escaped(_CONTROL.sub(lambda found: repr(found[0])[1:-1], text))
+    return escaped(printable(text))
 
 
 def table(
@@ -88,6 +87,8 @@ def table(
 
 
 def _plain(columns: Sequence[str], rows: Sequence[Sequence[str]], title: str, labels: int) -> str:
+    title, *cells = map(printable, (title, *columns, *(x for row in rows for x in row)))
+    columns, *rows = (cells[i : i + len(columns)] for i in range(0, len(cells), len(columns)))
     widths = [max(map(len, column)) for column in zip(columns, *rows, strict=True)]
     lines = (
         "  ".join(x.ljust(w) if i < labels else x.rjust(w) for i, (x, w) in enumerate(zip(r, widths, strict=True)))

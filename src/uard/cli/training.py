@@ -12,6 +12,7 @@ from tyro.conf import arg
 
 from uard import InvalidValueError
 from uard._support import files
+from uard._support.text import counted
 from uard.cli import progress
 from uard.cli.terminal import MANY, error, say
 
@@ -102,7 +103,7 @@ def _tell(failed: StudyFailedError, names: dict[str, str], console: Console) -> 
     for (name, why), seeds in list(cells.items())[:MANY]:
         say(console, f"failed: {name}, seeds {sorted(seeds)}: {why}")
     if len(cells) > MANY:
-        say(console, f"and {len(cells) - MANY} cells more")
+        say(console, f"and {counted(len(cells) - MANY, 'more cell')}")
 
 
 @contextmanager

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 from uard import _checks
-from uard.agents.base import Agent
 from uard.agents.tabular import QLearning
-from uard.envs.base import Environment
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab import registry
 from uard.lab.config import key_of, plain, settled
@@ -20,6 +18,7 @@ from uard.training.feedback.rating_model import RatingModel
 from uard.training.feedback.transition_model import QUERIES, TransitionModel
 
 EPISODES, STEPS = 500, 1_000_000
+_RENAMED = {"feedback": "rating_model"}
 # Of a mitigation that asks nobody, whatever was said of its raters.
 _UNASKED: dict[str, Any] = {"panel": MAIN, "noise": 0.0, "rated": 1.0, "rating_model": None, "query": "random"}
 
@@ -54,6 +53,17 @@ class Cell:
             on a simulator only).
     """
 
+    def __new__(cls, *_: Any, **fields: Any) -> Self:
+        """Refuse a field by a name that it had before.
+
+        Raises:
+            InvalidValueError: with the name that it has now.
+        """
+        for old, new in _RENAMED.items():
+            if old in fields:
+                raise _checks.InvalidValueError(old, fields[old], f"left out: the field is called {new} now")
+        return super().__new__(cls)
+
     environment: Any = field(default_factory=TrapGrid)
     mitigation: Mitigation = field(default_factory=Raw)
     agent: Any = field(default_factory=QLearning)
@@ -74,8 +84,8 @@ class Cell:
             InvalidValueError: a field out of range, or an agent that cannot work in the environment, with those that
                 can.
         """
-        for name, kind in _PARTS.items():
-            self._put(name, _part(name, getattr(self, name), kind))
+        for name in ("environment", "mitigation", "agent", "panel"):
+            self._put(name, _part(name, getattr(self, name)))
         self._check_numbers()
         trainer = registry.trainer(self.agent, self.environment)
         self._settle_budget(trainer)
@@ -105,7 +115,7 @@ class Cell:
             self._put("steps", int(steps))
             self._put("episodes", EPISODES)
         elif self.steps is not None:
-            raise _checks.InvalidValueError("steps", self.steps, "left out but on a simulator; see episodes")
+            raise _checks.InvalidValueError("steps", self.steps, "left out, except on a simulator: see episodes")
         if self.snapshots and not trainer.snapshots:
             raise _checks.InvalidValueError("snapshots", self.snapshots, "0 for an agent that keeps no tables")
 
@@ -120,7 +130,9 @@ class Cell:
             raise _checks.InvalidValueError("rating_model", model, f"{allowed}{why}")
         self._put("rating_model", settled("rating_model", model))
         if _checks.choose("query", self.query, QUERIES) not in trainer.queries:
-            raise _checks.InvalidValueError("query", self.query, f"{' or '.join(trainer.queries)} but on a simulator")
+            raise _checks.InvalidValueError(
+                "query", self.query, f"{' or '.join(trainer.queries)}, except on a simulator"
+            )
 
     def config(self) -> dict[str, Any]:
         """Return the whole configuration as plain data; see ``uard.lab.config``."""
@@ -144,13 +156,17 @@ class Cell:
         return replace(self, **changes)
 
 
-_PARTS: dict[str, type] = {"environment": Environment, "mitigation": Mitigation, "agent": Agent, "panel": Panel}
+_NAMED = {
+    "environment": "uard.lab.registry.environment({!r}, {{}})",
+    "mitigation": "uard.method.mitigations.named({!r})",
+    "agent": "uard.lab.registry.agent({!r}, {{}}, environment)",
+    "panel": "uard.ratings.panels.PANELS[{!r}]",
+}
 
 
-def _part(name: str, value: Any, kind: type) -> Any:
-    if not isinstance(value, kind) or not _checks.is_frozen(value):
-        hint = " (see uard.ratings.panels.PANELS)" if kind is Panel else ""
-        article = "an" if kind.__name__[0] in "AE" else "a"
-        allowed = f"a frozen dataclass that is {article} {kind.__name__}{hint}"
-        raise _checks.InvalidValueError(name, value, allowed)
+def _part(name: str, value: Any) -> Any:
+    fault = _checks.not_frozen(value, Panel) if name == "panel" else registry.FAULTS[name](value)
+    if fault is not None:
+        hint = f", such as {_NAMED[name].format(value)}" if isinstance(value, str) else ""
+        raise _checks.InvalidValueError(name, value, f"{fault}{hint}")
     return settled(name, value)

@@ -12,15 +12,21 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 from functools import cache
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from uard import _checks, plugins
+from uard._support.fields import scalar
 
 FORMAT = 3  # of configurations and keys; results with keys of an older one are brought over by ``uard migrate``
+LOCAL = "<locals>."
+_locals: WeakKeyDictionary[type, str] = WeakKeyDictionary()
+_numbers = (f"#{i}" for i in itertools.count(1))
 TYPE = "type"  # beside a configuration's fields, the name of its class
 
 
@@ -28,7 +34,8 @@ def type_name(cls: type) -> str:
     """Return the name of a class in configurations.
 
     Its own if it is uard's; ``package/Class`` if an entry point of its package names it, so that it may move; else
-    ``module/Class``, for a package may have two classes of that name.
+    ``module/Class``, for a package may have two classes of that name. One that is local to a function has a number,
+    too, for two calls of the function make two classes.
 
     Examples:
         >>> from uard.lab.cell import Cell
@@ -38,7 +45,30 @@ def type_name(cls: type) -> str:
     package = cls.__module__.partition(".")[0]
     if package == "uard":
         return cls.__qualname__
+    if LOCAL in cls.__qualname__:
+        return f"{cls.__module__}/{cls.__qualname__}{_locals.setdefault(cls, next(_numbers))}"
     return f"{package if _is_registered(cls, package) else cls.__module__}/{cls.__qualname__}"
+
+
+def check_names(config: Any) -> None:
+    """Check that a configuration can be found again by another process.
+
+    Examples:
+        >>> from uard.lab.cell import Cell
+        >>> check_names(Cell().config())
+
+    Raises:
+        InvalidValueError: a class is local to a function, which makes another one whenever it is called.
+    """
+    if isinstance(config, list):
+        for part in config:
+            check_names(part)
+    if isinstance(config, dict):
+        if LOCAL in config[TYPE]:
+            allowed = "a class outside functions: no other process could find its results, so no file keeps them"
+            raise _checks.InvalidValueError("class", config[TYPE].rpartition("#")[0], allowed)
+        for part in config.values():
+            check_names(part)
 
 
 def _is_registered(cls: type, package: str) -> bool:
@@ -127,15 +157,10 @@ def _settled_fields(name: str, value: Any) -> Any:
         if f.name == TYPE:
             raise _checks.InvalidValueError(f"{name}.{TYPE}", value, f"without a field named {TYPE!r}")
         old = getattr(value, f.name)
-        new = settled(f"{name}.{f.name}", old)
-        if type(new) is int and f.type in _FLOATS:
-            new = float(new)
+        new = scalar(f"{name}.{f.name}", settled(f"{name}.{f.name}", old), f.type)
         if type(new) is not type(old) or repr(new) != repr(old):
             changes[f.name] = new
     return dataclasses.replace(value, **changes) if changes else value
-
-
-_FLOATS = (float, "float", float | None, "float | None")  # as annotations, evaluated or not
 
 
 @cache

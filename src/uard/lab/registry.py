@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, get_args
 
 from uard import _checks, plugins
 from uard._support.fields import changed
 from uard.agents import continuous
 from uard.agents.actor_critic import SoftActorCritic, edac
-from uard.agents.base import Agent
+from uard.agents.base import Agent, Family
 from uard.agents.networks import Ensemble, Network
 from uard.agents.policy import CPO, PPO, TRPO
 from uard.agents.tabular import QLearning
 from uard.agents.value import DeepQ
-from uard.envs.base import Environment
+from uard.envs.base import Environment, Kind
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.envs.names import ENVIRONMENTS
 from uard.lab.trainers import Trainer, trainer_of
@@ -119,7 +119,14 @@ def trainer(agent: Any, environment: Any) -> Trainer:
         why = "which does not fit into tables"
     else:
         why = "whose actions are discrete"
-    raise _checks.InvalidValueError("agent", agent, f"one that can work in {type(environment).__name__}, {why}: {able}")
+    where = _known(environment, ENVIRONMENTS) or type(environment).__name__
+    shown = _known(agent, agents(environment)) or _known(agent, AGENTS) or agent
+    raise _checks.InvalidValueError("agent", shown, f"one that can work in {where}, {why}: {able}")
+
+
+def _known(value: Any, names: Mapping[str, Any]) -> str:
+    """Return the name of an environment or agent as it is listed; no text if it has none."""
+    return next((name for name, other in names.items() if other == value), "")
 
 
 def agents(environment: Any = None) -> dict[str, Any]:
@@ -139,11 +146,22 @@ OWN: dict[str, tuple[str, ...]] = {
     "agent": (*dict.fromkeys((*AGENTS, *CONTINUOUS)),),
     "mitigation": (*mitigation.NAMED,),
 }
-IS_ONE: dict[str, Callable[[Any], bool]] = {
-    "environment": lambda value: isinstance(value, Environment),
-    "agent": lambda value: isinstance(value, Agent),
-    "mitigation": mitigation.is_mitigation,
+
+
+def _fault(value: object, kind: type, declared: str, known: tuple[str, ...]) -> str | None:
+    if (why := _checks.not_frozen(value, kind)) is not None:
+        return why
+    if getattr(value, declared, None) not in known:
+        return f"an {kind.__name__} that declares its {declared}: {', '.join(known)}"
+    return None
+
+
+FAULTS: dict[str, Callable[[Any], str | None]] = {
+    "environment": lambda value: _fault(value, Environment, "kind", get_args(Kind)),
+    "agent": lambda value: _fault(value, Agent, "family", get_args(Family)),
+    "mitigation": mitigation.fault,
 }
+"""Of each kind, what says what an object must be if it cannot be used as one; None if it can."""
 
 
 def brought(kind: str) -> tuple[dict[plugins.Plugin, Any], list[plugins.PluginError]]:
@@ -154,13 +172,13 @@ def brought(kind: str) -> tuple[dict[plugins.Plugin, Any], list[plugins.PluginEr
         >>> broken
         []
     """
-    return plugins.brought(kind, lambda plugin: plugin.load(IS_ONE[kind])(), OWN[kind])
+    return plugins.brought(kind, lambda plugin: plugin.make(FAULTS[kind]), OWN[kind])
 
 
 def _of(kind: str, name: str, ours: dict[str, Any]) -> Any:
     if name in ours:
         return ours[name]
-    return plugins.pick(kind, name, OWN[kind], [*ours]).load(IS_ONE[kind])()
+    return plugins.pick(kind, name, OWN[kind], [*ours]).make(FAULTS[kind])
 
 
 def environment(name: str, changes: dict[str, Any]) -> Any:

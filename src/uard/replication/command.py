@@ -10,9 +10,14 @@ from tyro.conf import Positional
 from uard import _checks
 from uard.cli import terminal, training
 from uard.cli.training import DEFAULT_STORE, UNWATCHED, WatchOptions
+from uard.replication.verdicts import FAILS, HOLDS, IN_PART, UNTESTABLE
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rich.console import Console
+
+    from uard.replication.ledger import Entry
 
 
 @dataclass(frozen=True)
@@ -52,4 +57,18 @@ class Ledger:
         if self.json is not None:
             terminal.write_json(ledger.as_data(entries, seeds), self.json)
         if self.json != "-":
-            ledger.to_rich(entries)
+            show(entries)
+
+
+def show(entries: Sequence[Entry]) -> None:
+    """Print lines of the ledger, each as a paragraph: a table of so much text could not be read at 80 columns."""
+    from rich.padding import Padding
+
+    colour = {HOLDS: "green", IN_PART: "yellow", FAILS: "red", UNTESTABLE: "dim"}
+    sign = {True: "+", False: "-", None: "?"}
+    out = terminal.output()
+    for e in entries:
+        out.print(f"[bold]{e.claim}[/bold] [{colour[e.verdict]}]{e.verdict}[/]" + f" ({e.count})" * bool(e.count))
+        parts = (f"{sign[part.holds]} {part.name}" + " (opinion)" * part.opinion for part in e.parts)
+        for text in (e.statement, f"ours: {e.ours}", *parts, f"why: {e.why}"):
+            out.print(Padding(terminal.escape(text), (0, 0, 0, 4)))

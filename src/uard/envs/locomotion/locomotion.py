@@ -15,6 +15,7 @@ from typing import ClassVar, final
 import numpy as np
 
 from uard import _checks
+from uard._support import fields
 from uard.envs.base import SimulatedEnvironment
 from uard.envs.locomotion.mujoco import MujocoModel, MujocoSimulator
 from uard.envs.locomotion.regions import REGIONS, Motion, Region, Vibration
@@ -139,6 +140,7 @@ class Locomotion(SimulatedEnvironment):
         Raises:
             InvalidValueError: naming the field, the value and what is allowed.
         """
+        fields.check(self)
         _checks.choose("robot", self.robot, ROBOTS)
         _checks.whole("version", self.version, low=4, high=5)
         _checks.whole("horizon", self.horizon, low=1, high=1_000_000)

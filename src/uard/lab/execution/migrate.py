@@ -85,7 +85,7 @@ def migrate(path: str | Path) -> Migration:
         StoreError: the store is damaged, cannot be written, is in use, or is of another format than the last.
     """
     path = Path(path).resolve()  # the file itself, not a link to it
-    if not path.is_file():
+    if not os.path.isfile(path):  # Path's raises for a long name
         raise _checks.InvalidValueError("path", str(path), "a result store, or a JSON file of published results")
     backup = path.with_name(f"{path.name}.format-{format_2.NUMBER}")
     return _migrate_published(path, backup) if path.suffix == ".json" else _migrate_store(path, backup)

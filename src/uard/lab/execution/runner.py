@@ -19,8 +19,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uard._support import files
+from uard._support import files, signals
+from uard._support.text import counted
 from uard.lab.cell import Cell
+from uard.lab.config import check_names
 from uard.lab.execution.batching import Job, batches, shape_of
 from uard.lab.execution.claims import HEARTBEAT, Owner
 from uard.lab.execution.forecast import Forecast
@@ -59,7 +61,9 @@ class StudyFailedError(RuntimeError):
         """Name the first failed cell and its error."""
         first = failures[0]
         lost = sum(len(f.jobs) for f in failures)
-        super().__init__(f"{lost} seeds failed, the rest is stored; first: {first.jobs[0][0]}\n{first.error}")
+        super().__init__(
+            f"{counted(lost, 'seed')} failed, the rest is stored; first: {first.jobs[0][0]}\n{first.error}"
+        )
         self.failures = tuple(failures)
 
 
@@ -92,6 +96,7 @@ def run(
         engine: What trains the batches instead of processes on this machine: ``uard.lab.execution.cluster.Ray``, say.
 
     Raises:
+        InvalidValueError: a cell has a class that is local to a function, and the store is a file.
         StudyFailedError: some jobs raised; all others are stored, and the store says why. Each is tried once.
         StoreError: the store cannot be written; what was finished before is safe.
     """
@@ -107,6 +112,7 @@ def run(
         while todo:
             with closing(_train(batches(todo), workers, work.folder, work.claim, engine)) as outcomes:
                 for batch, answer in outcomes:
+                    signals.check()  # what it has disturbed must not be recorded as a failure
                     work.record(batch, answer)
             todo = work.wait_for_others()
     if work.failures:
@@ -118,6 +124,9 @@ def _missing(jobs: Sequence[Job], store: Store) -> list[Job]:
     wanted: dict[Cell, list[int]] = {}
     for cell, seed in jobs:
         wanted.setdefault(cell, []).append(seed)
+    if store.path != ":memory:":
+        for cell in wanted:
+            check_names(cell.config())
     return [(cell, seed) for cell, seeds in wanted.items() for seed in store.missing(cell, dict.fromkeys(seeds))]
 
 
@@ -192,6 +201,7 @@ class _Work:
         if waiting:
             log.info("waiting for %d seeds that other processes train", len(waiting))
         while waiting:
+            signals.check()
             held, free, failed = _sort_out(waiting, self._store, self._failed_before)
             for error in dict.fromkeys(failed.values()):
                 self._fail([job for job, e in failed.items() if e == error], error)

@@ -6,6 +6,7 @@ It also says who is training what, so that several processes share the work, and
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 import time
 from collections import Counter, defaultdict
@@ -17,7 +18,7 @@ from typing import Any, TypeVar
 
 from uard import InvalidValueError, __version__, _checks
 from uard.lab.cell import Cell
-from uard.lab.config import FORMAT
+from uard.lab.config import FORMAT, check_names
 from uard.lab.execution import rows
 from uard.lab.execution.claims import Owner
 from uard.lab.execution.reading import can_be_written, open_for_reading
@@ -164,7 +165,9 @@ class Store:
             StoreError: the folder cannot be written, or the file is no sound result store, or is not there.
         """
         self.path = str(path)
-        if readonly and not Path(self.path).is_file():
+        if not self.path or os.path.isdir(self.path):
+            raise StoreError(f"store = {self.path!r}: must be a file, not a folder")
+        if readonly and not os.path.isfile(self.path):  # Path's raises for a long name
             raise StoreError(f"store = {self.path!r}: must be a result store, but there is no such file")
         self.readonly = readonly or (Path(self.path).is_file() and not can_be_written(self.path))
         self._damaged_rows: dict[int, DamagedSeed] = {}  # by rowid
@@ -241,7 +244,10 @@ class Store:
                     self._db.execute(f"delete from {table} where key = ? and seed = ?", (key, seed))
 
     def _describe(self, cell: Cell) -> None:
-        config = json.dumps(cell.config(), sort_keys=True)
+        plain = cell.config()
+        if self.path != ":memory:":
+            check_names(plain)
+        config = json.dumps(plain, sort_keys=True)
         put = "insert into cells values (?, ?) on conflict (key) do update set config = ? where config is not ?"
         self._db.execute(put, (cell.key, config, config, config))
 

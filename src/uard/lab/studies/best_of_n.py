@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from uard import _checks
+from uard._support import fields
 from uard.lab.statistics import summarise
 from uard.method.mitigations import Evidence, Mitigation, named
 from uard.ratings.aggregate import aggregate
@@ -69,6 +70,7 @@ class Problem:
         Raises:
             InvalidValueError: naming the field, the value and what is allowed.
         """
+        fields.check(self)
         _checks.whole("features", self.features, low=2)
         _checks.whole("pool", self.pool, low=LARGEST)
         _checks.whole("models", self.models, low=2)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, final
 
 import numpy as np
 
+from uard._support import signals
 from uard.lab.result import Result
 from uard.lab.trainers.base import Finish, Trainer
 from uard.lab.trainers.examine import examine
@@ -58,7 +59,7 @@ class Simulated(Trainer):
         )
         loop = loop_of(job)
         path = None if folder is None else checkpoint_of(folder, cell, seed)
-        trained = host.run(loop, path, f"{cell.key} {seed}")
+        trained = host.run(loop, path, f"{cell.key} {seed}", stop=lambda: signals.received() is not None)
         extra = {"evaluation": trained.evaluation.astype(np.float32), "ends": trained.ends}
         extra |= examine(loop, trained.state)
         return Result(trained.log.astype(np.float32), int(trained.state.steps), np.zeros(0, np.int32), extra)

@@ -61,6 +61,7 @@ def write(
         seeds=len(results.seeds),
         window=WINDOW,
         sections=every,
+        programs=[f"{{\n{s.js}\n}}" for s in every if s.js],
         links=[link for _, *link in sorted([*links, (_LEADERBOARD, "leaderboard.html", "Leaderboard")])],
     )
     files.prepare_folder(folder, "report")

@@ -29,7 +29,8 @@ class Section:
         order: Its place: sections are sorted by this number. Ours stand at 20 (where uard loses), 60 (every
             mitigation), 75 (games), 90 (best-of-n) and 1000 (how the report was made).
         html: What it says below its heading; taken as it is, so text in it must be escaped
-            (``uard.lab.views.templates``).
+            (``uard.lab.views.templates``). What would run in it does not: no ``<script>``, no ``onclick``, no
+            ``style`` attributes.
         label: What the navigation calls it; the title if empty.
         css: Rules for it.
         js: A program for it, in a scope of its own. Nothing on the page may be loaded from elsewhere.
@@ -56,6 +57,9 @@ class Section:
         if not re.fullmatch(r"[a-z][a-z0-9-]*", self.id):
             raise _checks.InvalidValueError("id", self.id, "small letters, digits and hyphens")
         _checks.number("order", self.order)
+        for name, end in (("css", "</style"), ("js", "</script")):
+            if end in getattr(self, name).lower():
+                raise _checks.InvalidValueError(name, getattr(self, name), f"without {end}>")
         for name in self.files:
             if not re.fullmatch(r"\w[\w.-]*", name) or name in PAGES:
                 raise _checks.InvalidValueError("files", name, f"a plain name, none of {', '.join(PAGES)}")

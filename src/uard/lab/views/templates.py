@@ -1,7 +1,14 @@
-"""Templates of pages: text that stands in them is escaped, a name that nobody gave is an error."""
+"""Templates of pages: text that stands in them is escaped, a name that nobody gave is an error.
+
+Every page begins with ``policy(styles, programs)``: a browser then loads nothing from elsewhere and runs nothing but
+these very programs, whatever a text on the page, or the HTML of a section, may contain.
+"""
 
 from __future__ import annotations
 
+import base64
+import hashlib
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +24,8 @@ HERE = Path(__file__).parent
 def render(folder: Path, name: str, **values: Any) -> str:
     """Return a template's text with its places filled in.
 
-    A template may use ``show(table)`` and ``picture(title, note, image)``, which are the functions of this module.
+    A template may use ``show(table)``, ``picture(title, note, image)`` and ``policy(styles, programs)``, which are the
+    functions of this module.
 
     Args:
         folder: Where the template is.
@@ -31,7 +39,7 @@ def render(folder: Path, name: str, **values: Any) -> str:
 def _environment(folder: Path) -> jinja2.Environment:
     loader = jinja2.FileSystemLoader([folder, HERE])
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    environment.globals.update(show=table, picture=picture)
+    environment.globals.update(show=table, picture=picture, policy=policy)
     return environment
 
 
@@ -43,3 +51,28 @@ def table(data: Table) -> Markup:
 def picture(title: str, note: str, image: str) -> Markup:
     """Return a figure as HTML; ``image`` is a ``data:`` address (``uard.lab.views.figures.data_uri``)."""
     return Markup(render(HERE, "picture.html.j2", title=title, note=note, image=image))
+
+
+def policy(styles: Iterable[str], programs: Iterable[str]) -> Markup:
+    """Return the Content-Security-Policy of a page, to stand at its head.
+
+    Args:
+        styles: Contents of its ``<style>`` elements, to the letter; attributes of that name have no effect.
+        programs: Contents of its ``<script>`` elements; attributes such as ``onclick`` and ``javascript:`` links run
+            nothing.
+    """
+
+    def hashes(texts: Iterable[str]) -> str:
+        digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in texts)
+        return " ".join(f"'sha256-{digest}'" for digest in digests) or "'none'"
+
+    rules = {
+        "default-src": "'none'",
+        "img-src": "data:",
+        "style-src": hashes(styles),
+        "script-src": hashes(programs),
+        "base-uri": "'none'",
+        "form-action": "'none'",
+    }
+    content = "; ".join(f"{name} {value}" for name, value in rules.items())
+    return Markup('<meta http-equiv="Content-Security-Policy" content="{}">').format(Markup(content))

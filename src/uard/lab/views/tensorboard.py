@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from uard import _checks
+from uard._support import files
 from uard.lab.cell import Cell
 from uard.lab.execution.store import Store
 from uard.lab.result import Result
@@ -44,8 +45,7 @@ class Events:
         self._events: Any = event_pb2
         self._summaries: Any = summary_pb2
         self._writer = EventFileWriter
-        with self._writable():
-            self.folder.mkdir(parents=True, exist_ok=True)
+        files.prepare_folder(folder, "tensorboard")
 
     def place(self, cell: Cell, seed: int) -> Path:
         """Return the folder of a seed."""

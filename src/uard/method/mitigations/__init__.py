@@ -5,7 +5,7 @@ from uard.method.mitigations.baselines import RatedReward, Raw, Screening
 from uard.method.mitigations.discounting import RewardDiscounting, uard, uard_paper
 from uard.method.mitigations.panel_statistics import PanelStatistics
 from uard.method.mitigations.protocol import Backup, Evidence, Explanation, LearningSignal, Mitigation
-from uard.method.mitigations.registry import NAMED, is_mitigation, named
+from uard.method.mitigations.registry import NAMED, fault, named
 
 __all__ = [
     "NAMED",
@@ -21,7 +21,7 @@ __all__ = [
     "Raw",
     "RewardDiscounting",
     "Screening",
-    "is_mitigation",
+    "fault",
     "named",
     "uard",
     "uard_paper",

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from uard import plugins
+from uard import _checks, plugins
 from uard.method.mitigations.baselines import RatedReward, Raw, Screening
 from uard.method.mitigations.discounting import uard, uard_paper
 from uard.method.mitigations.protocol import Mitigation
@@ -50,14 +51,25 @@ def named(name: str, **parameters: Any) -> Mitigation:
     """
     if name in NAMED:
         return NAMED[name](**parameters)
-    return plugins.pick("mitigation", name, NAMED, [*NAMED]).load(is_mitigation)(**parameters)
+    return plugins.pick("mitigation", name, NAMED, [*NAMED]).make(fault, **parameters)
 
 
-def is_mitigation(value: object) -> bool:
-    """Whether ``value`` is a mitigation.
+def fault(value: object) -> str | None:
+    """Say what an object must be if it cannot be used as a mitigation; None if it can.
 
     Examples:
-        >>> is_mitigation(named("raw")), is_mitigation("raw")
-        (True, False)
+        >>> fault(named("raw")), fault(Raw)
+        (None, 'a frozen dataclass that is a Mitigation, and this is a class: Raw(...) makes one')
     """
-    return isinstance(value, Mitigation)
+    if (why := _checks.not_frozen(value, Mitigation)) is not None:
+        return why
+    for name in ("fit", "signal", "score", "explain", "without_prior"):
+        _, *wanted = inspect.signature(getattr(Mitigation, name)).parameters.values()
+        keywords = [p.name for p in wanted if p.kind is p.KEYWORD_ONLY]
+        positional = [p.name for p in wanted if p.name not in keywords]
+        try:
+            inspect.signature(getattr(value, name)).bind(*positional, **dict.fromkeys(keywords))
+        except (TypeError, ValueError):
+            call = ", ".join([*positional, *(f"{k}=..." for k in keywords)])
+            return f"a Mitigation whose {name} can be called as every mitigation's is: {name}({call})"
+    return None

@@ -5,7 +5,7 @@ follows from the conditions by one rule (``uard.replication.verdicts``). Grid st
 of deep agents and of MuJoCo, from the published results.
 """
 
-from uard.replication.ledger.entries import CLAIMS, Entry, as_data, entries, to_rich
+from uard.replication.ledger.entries import CLAIMS, Entry, as_data, entries
 from uard.replication.verdicts import VERDICTS
 
-__all__ = ["CLAIMS", "VERDICTS", "Entry", "as_data", "entries", "to_rich"]
+__all__ = ["CLAIMS", "VERDICTS", "Entry", "as_data", "entries"]

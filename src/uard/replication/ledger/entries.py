@@ -1,4 +1,4 @@
-"""The ledger itself: words, numbers and verdict of every claim, as data and for the terminal."""
+"""The ledger itself: words, numbers and verdict of every claim, as data."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from uard.replication.ledger import (
     words,
 )
 from uard.replication.ledger.claim import Conditions
-from uard.replication.verdicts import FAILS, HOLDS, IN_PART, UNTESTABLE, Outcome, judged
+from uard.replication.verdicts import Outcome, judged
 
 CLAIMS = tuple(words.read())
 CONDITIONS: dict[str, Conditions] = {
@@ -81,24 +81,3 @@ def entry(claim: str, numbers: dict[str, Any] | None) -> Entry:
 def as_data(entries: Sequence[Entry], seeds: Sequence[int]) -> dict[str, Any]:
     """Return the ledger as plain data, for ``ledger.json``."""
     return {"version": __version__, "seeds": list(seeds), "entries": [asdict(e) for e in entries]}
-
-
-def to_rich(entries: Sequence[Entry]) -> None:
-    """Print the ledger."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    colour = {HOLDS: "green", IN_PART: "yellow", FAILS: "red", UNTESTABLE: "dim"}
-    table = Table("claim", "statement", "ours", "verdict", "parts", "why", show_lines=True)
-    for e in entries:
-        verdict = f"[{colour[e.verdict]}]{e.verdict}[/]" + f"\n{e.count}" * bool(e.count)
-        parts = "\n".join(map(_said, e.parts))
-        table.add_row(e.claim, escape(e.statement), escape(e.ours), verdict, escape(parts), escape(e.why))
-    Console().print(table)
-
-
-def _said(part: Outcome) -> str:
-    """Return one part in a line, with its sign: + holds, - does not, ? cannot be tested."""
-    sign = {True: "+", False: "-", None: "?"}[part.holds]
-    return f"{sign} {part.name}" + " (opinion)" * part.opinion

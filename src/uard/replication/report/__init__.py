@@ -127,7 +127,7 @@ def _ledger(results: StudyResults, entries: Sequence[Entry], verdicts: Mapping[s
 
 def _audit() -> Section:
     html = render(HERE, "audit.html.j2", checks=[_check(c) for c in audit.run()])
-    return Section("audit", "The paper's arithmetic, recomputed", 120, html, "Arithmetic")
+    return Section("audit", "The paper's arithmetic, recomputed", 120, html, "Arithmetic", _text("audit.css"))
 
 
 def _check(c: audit.Check) -> dict[str, str]:

@@ -6,7 +6,8 @@ film[0].walks.uard.forEach((_, i) => seed.add(new Option(i)));
 film.forEach((f, i) => grid.add(new Option(f.name, i, false, f.size === 10 && f.name.includes("main"))));
 for (const agent in colours) {
   const box = document.createElement("figure");
-  box.innerHTML = `<figcaption style="color:${colours[agent]}">${agent}</figcaption><canvas width="660" height="660" data-agent="${agent}" role="img" aria-label="Walk of ${agent}"></canvas><div class="count" data-agent="${agent}"></div>`;
+  box.innerHTML = `<figcaption>${agent}</figcaption><canvas width="660" height="660" data-agent="${agent}" role="img" aria-label="Walk of ${agent}"></canvas><div class="count" data-agent="${agent}"></div>`;
+  box.firstChild.style.color = colours[agent];
   stage.append(box);
 }
 function draw() {

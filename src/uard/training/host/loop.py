@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from uard import _checks
+from uard._support import fields
 from uard.envs.base import SimulatedEnvironment
 from uard.envs.simulator import Simulator, StepResult, rate
 from uard.method.mitigations import Mitigation
@@ -69,6 +70,9 @@ class Job:
         """
         if not isinstance(self.panel, Panel):
             raise _checks.InvalidValueError("panel", self.panel, "a Panel (see uard.ratings.panels.PANELS)")
+        fields.check(self)
+        _checks.whole("seed", self.seed)
+        _checks.whole("ddof", self.ddof, low=0, high=1)
         _checks.number("noise", self.noise, low=0)
         _checks.whole("steps", self.steps, low=1, high=10**12)
         _checks.number("rated", self.rated, low=0, high=1)
