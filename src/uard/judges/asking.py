@@ -174,7 +174,7 @@ def as_scores(name: str, answer: Any, size: int) -> Float[np.ndarray, " B"]:
         InvalidValueError: for another number of scores, or one that is no finite number; names judge and place.
     """
     allowed = f"a list of {size} numbers (or None), one per completion"
-    if not is_listed(answer):
+    if not hasattr(answer, "tolist") and not is_listed(answer):
         raise _checks.InvalidValueError(f"answer of judge {name!r}", answer, allowed)
     try:
         listed: Any = answer.tolist() if hasattr(answer, "tolist") else list(answer)
@@ -309,7 +309,8 @@ def _listed(answer: Any, size: int) -> Any:
 def _with_own_lists(question: dict[str, Any]) -> dict[str, Any]:
     """Return a question with lists and, of prompts and completions, messages of its own."""
     deep: dict[str, Any] = {name: _copied(question[name]) for name in ("prompts", "completions") if name in question}
-    return {name: [*value] if type(value) is list else value for name, value in question.items()} | deep
+    shallow = {name: cast("list[Any]", value)[:] if type(value) is list else value for name, value in question.items()}
+    return shallow | deep
 
 
 def _copied(value: Any) -> Any:

@@ -92,11 +92,9 @@ class ReliabilityCallback(TrainerCallback):
         file = _file(args, state)
         if file.exists():
             self.reward.load(file)
-        elif file.with_suffix(".pkl").exists():
-            allowed = (
-                f"{file.name}: a pickle executes what it holds and is not read. Delete it to go on with new scales"
-            )
-            raise _checks.InvalidValueError("what the reward knew", str(file.with_suffix(".pkl")), allowed)
+        elif (old := file.with_suffix(".pkl")).exists():
+            allowed = f"{file.name}; a pickle executes what it holds and is not read: delete it to go on without"
+            raise _checks.InvalidValueError("what the reward knew", str(old), allowed)
         else:
             warnings.warn(
                 f"training is resumed at step {state.global_step}, but {file} does not exist: the judges' scales and "
