@@ -101,24 +101,21 @@ class Scale:
             return none
         if self.fixed is not None:
             return values[abs(_held(values) - self.known.mean) > ABSURD * self.fixed]
-        new = values.ravel() if self.lone is None else np.append(values, self.lone)
-        self.lone, base = None, self.known
+        given = np.sort(values if self.lone is None else np.append(values, self.lone), axis=None)
+        new, base, self.lone = _held(given), self.known, None
         if base.deviation == 0:
-            near = np.argsort(abs(_held(new) - (base.mean if base.number else np.median(_held(new)))), kind="stable")
-            base = base.including(_held(new[near[: -max(1, new.size // 32)]]))
-            odd = abs(_held(new) - base.mean) > EQUAL * abs(base.mean)
+            base = base.including(_without_the_farthest(new, base.mean if base.number else float(np.median(new))))
+            odd = abs(new - base.mean) > EQUAL * abs(base.mean)
             if base.deviation == 0 and base.number and odd.sum() == 1:
-                self.known, self.lone = self.known.including(_held(new[~odd])), float(new[odd][0])
+                self.known, self.lone = self.known.including(new[~odd]), float(given[odd][0])
                 return none
-        unit = base.deviation or math.inf
-        distance = abs(_held(new) - base.mean)
+        unit, distance = base.deviation or math.inf, abs(new - base.mean)
         self.far = self.far + 1 if 2 * (distance > FAR * unit).sum() > new.size else 0
-        if self.far >= CHANGED and NONE.including(_held(new)).deviation > 0:
+        if self.far >= CHANGED and NONE.including(new).deviation > 0:
             self.known, self.far = NONE, 0
-            return self.observe(new)
-        cut = np.clip(_held(new), base.mean - FAR * unit, base.mean + FAR * unit)
-        self.known = self.known.including(cut)
-        return new[distance > ABSURD * unit] if base.number >= FEW else none
+            return self.observe(given)
+        self.known = self.known.including(np.clip(new, base.mean - FAR * unit, base.mean + FAR * unit))
+        return given[distance > ABSURD * unit] if base.number >= FEW else none
 
     def ratings(self, values: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
         """Return (x - location) / deviation; NaN while the deviation is 0, when numbers mean nothing."""
@@ -127,6 +124,11 @@ class Scale:
 
     def _all(self) -> Moments:
         return self.known if self.lone is None else self.known.including(_held(np.array([self.lone])))
+
+
+def _without_the_farthest(values: Float[np.ndarray, " n"], centre: float) -> Float[np.ndarray, " ordinary"]:
+    nearest = np.argsort(abs(values - centre), kind="stable")
+    return values[nearest[: -max(1, values.size // 32)]]
 
 
 def _held(values: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
