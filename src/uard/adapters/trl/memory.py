@@ -25,6 +25,10 @@ LARGEST_COUNT = 2**53  # numbers in a file; larger ones are no counts
 class Tally:
     """Counts over all completions so far; those of each judge by its name.
 
+    Examples:
+        >>> Tally.of(["length", "clarity"]).missing
+        {'length': 0, 'clarity': 0}
+
     Attributes:
         missing: How many each judge did not score.
         late: Batches for which each judge, or ``sigma_m``, was late.
@@ -57,12 +61,7 @@ class Tally:
 
     @classmethod
     def of(cls, judges: Iterable[str]) -> Tally:
-        """Return the counts of judges before the first batch.
-
-        Examples:
-            >>> Tally.of(["length", "clarity"]).missing
-            {'length': 0, 'clarity': 0}
-        """
+        """Return the counts of judges before the first batch."""
         names = list(judges)
         missing, absurd, compared, told_apart = (dict.fromkeys(names, 0) for _ in range(4))
         return cls(missing, dict.fromkeys([*names, "sigma_m"], 0), absurd, compared, told_apart)
