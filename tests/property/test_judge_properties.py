@@ -1,5 +1,6 @@
 """Whatever judges answer: a named error or finite rewards, and never a number that depends on the judges' order."""
 
+import json
 import warnings
 from decimal import Decimal
 
@@ -107,3 +108,42 @@ def test_a_scale_is_finite_and_does_not_depend_on_the_order_within_a_call(calls)
     assert scale.deviation >= 0
     assert scale.location == pytest.approx(reverse.location, rel=1e-6, abs=1e-6 * scale.deviation)
     assert scale.deviation == pytest.approx(reverse.deviation, rel=1e-6)
+
+
+plain = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+)
+
+
+def places(content, path=()):
+    """Every place in nested lists and dictionaries."""
+    parts = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    for name, part in parts:
+        yield (*path, name)
+        yield from places(part, (*path, name))
+
+
+@settings(deadline=None)
+@given(st.data())
+def test_a_changed_file_is_refused_or_gives_finite_rewards(tmp_path_factory, data):
+    file = tmp_path_factory.mktemp("files") / "reward.json"
+    columns = [[1.0, 2.0, 4.0], [None, 2.0, 1.0]]
+    reward = reward_of(map(says, columns))
+    reward(["p"] * 3, ["c"] * 3)
+    reward.save(file)
+    content = json.loads(file.read_text())
+    *way, last = data.draw(st.sampled_from(list(places(content))))
+    where = content
+    for name in way:
+        where = where[name]
+    where[last] = data.draw(plain)
+    file.write_text(json.dumps(content))
+    other = reward_of(map(says, columns))
+    try:
+        other.load(file)
+    except InvalidValueError:
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        assert np.isfinite(other(["p"] * 3, ["c"] * 3)).all()
