@@ -1,13 +1,16 @@
 """Several judges as one reward: the arithmetic by hand, bad judges, and real training with TRL's trainers."""
 
 import asyncio
+import copy
 import functools
 import importlib.util
 import logging
+import os
 import pickle
 import subprocess
 import sys
 import threading
+import time
 import warnings
 from pathlib import Path
 
@@ -21,9 +24,11 @@ from trl import GRPOConfig, GRPOTrainer, RLOOConfig, RLOOTrainer
 
 from uard import InvalidValueError, UnknownNameError
 from uard.adapters.trl import (
+    AbsurdScoreWarning,
     DiscountCancelledWarning,
     ForgottenWarning,
     JudgeError,
+    LateJudgeWarning,
     ReliabilityCallback,
     RewardModel,
     UncertaintyDiscountedReward,
@@ -239,6 +244,176 @@ def test_async_judges_run_together_on_one_loop():
     assert len(set(loops)) == 1
 
 
+async def hangs(completions, **kwargs):
+    await asyncio.sleep(3600)
+
+
+def test_a_late_judge_is_missing_named_counted_and_warned_of_once():
+    means = {}
+    reward = UncertaintyDiscountedReward({"a": says([1, 3]), "b": says([1, 3]), "slow": hangs}, timeout=0.2)
+    with pytest.warns(LateJudgeWarning, match="judge 'slow' did not answer within 0.2 s: its scores are missing"):
+        assert ask(reward, 2, log_metric=means.__setitem__) == pytest.approx([-1, 1])
+    assert ask(reward, 2) == pytest.approx([-1, 1])  # warnings are errors
+    assert reward.tally.late == {"a": 0, "b": 0, "slow": 2, "sigma_m": 0}
+    assert reward.tally.missing == {"a": 0, "b": 0, "slow": 4}
+    assert means["uard/slow/missing"] == 1
+    assert 0.2 <= means["uard/slow/seconds"] < 10
+    assert 0 <= means["uard/a/seconds"] < 0.2
+
+
+def test_a_late_ensemble_counts_as_none():
+    reward = UncertaintyDiscountedReward(panel([1, 3], [1, 3]), sigma_m=hangs, timeout={"sigma_m": 0.2})
+    with pytest.warns(LateJudgeWarning, match="'sigma_m' did not answer within 0.2 s: its disagreement counts as 0"):
+        assert ask(reward, 2) == pytest.approx([-1, 1])
+    assert reward.last.sigma_m.tolist() == [0, 0]
+
+
+# What a judge may not do to the others
+
+
+def scores_of_prompt(prompts, **kwargs):
+    return [{"easy": 2.0, "hard": -8.0}[prompt] for prompt in prompts]
+
+
+def test_a_judge_that_scores_the_prompt_is_left_out_and_named():
+    prompts = ["easy"] * 4 + ["hard"] * 4
+    clarity, style = [0.8, 0.7, 0.9, 0.7] * 2, [1, 0, 0, 1] * 2
+    judges = {"clarity": says(clarity), "style": says(style)}
+    alone = UncertaintyDiscountedReward(judges)
+    reward = UncertaintyDiscountedReward({"difficulty": scores_of_prompt, **judges})
+    for _ in range(7):
+        assert ask(reward, 8, prompts) == ask(alone, 8, prompts)
+    with pytest.warns(UselessJudgeWarning, match="judge 'difficulty' has scored 16 groups and told the completions of"):
+        assert ask(reward, 8, prompts) == ask(alone, 8, prompts)
+    assert ask(reward, 8, prompts) == ask(alone, 8, prompts)  # said once
+    assert reward.deviations["difficulty"] == pytest.approx(5)
+    assert reward.last.sigma_h == pytest.approx(alone.last.sigma_h)
+
+
+def test_a_judge_counts_from_the_first_difference_within_a_group_on():
+    reward = UncertaintyDiscountedReward({"a": says([1, 1, 2, 2], [1, 1, 1, 2]), "b": says([1, 2, 1, 2])})
+    prompts = ["p", "p", "q", "q"]
+    ask(reward, 4, prompts)
+    assert np.isnan(reward.last.ratings[:, 0]).all()
+    for _ in range(2):
+        ask(reward, 4, prompts)
+        assert not np.isnan(reward.last.ratings).any()
+    assert reward.tally.compared == {"a": 6, "b": 6}
+    assert reward.tally.told_apart == {"a": 2, "b": 6}
+
+
+def test_without_groups_nobody_is_left_out():
+    reward = UncertaintyDiscountedReward(panel([1, 2], [5, 7]))
+    assert ask(reward, 2, ["p", "q"]) == pytest.approx([-1, 1])
+
+
+def test_an_absurd_score_is_named_and_does_not_silence_its_judge():
+    rng = np.random.default_rng(0)
+    glitch = []
+    reward = UncertaintyDiscountedReward(
+        {"a": lambda **_: [*rng.normal(size=7), *(glitch or [0.5])], "b": lambda **_: rng.normal(size=8)}
+    )
+    for _ in range(50):
+        ask(reward, 8)
+    before = reward.deviations["a"]
+    glitch.append(1e200)
+    with pytest.warns(AbsurdScoreWarning, match=r"judge 'a' gave the score 1e\+200, more than 100 of its standard"):
+        assert np.isfinite(ask(reward, 8)).all()
+    assert reward.last.ratings[-1, 0] == 5
+    glitch.clear()
+    for _ in range(100):
+        ask(reward, 8)
+    assert reward.deviations["a"] == pytest.approx(before, rel=0.1)
+    assert reward.tally.absurd == {"a": 1, "b": 0}
+
+
+def test_each_thread_gets_its_own_rewards():
+    def slowly(completions, **kwargs):
+        time.sleep(0.001)
+        return [float(text) for text in completions]
+
+    reward = UncertaintyDiscountedReward({"a": example_floats, "b": slowly}, scales=AS_THEY_ARE[:2], clip=1e6)
+    wrong = []
+
+    def work(sign):
+        for _ in range(60):
+            rewards = reward(["p"] * 4, [str(sign * (j + 1)) for j in range(4)])
+            wrong.extend(x for x in rewards if np.sign(x) != sign)
+
+    threads = [threading.Thread(target=work, args=(sign,)) for sign in (1, -1, 1, -1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+    assert reward.tally.completions == 4 * 60 * 4
+    assert reward.tally.told_apart == {"a": 240, "b": 240}
+
+
+def example_floats(completions, **kwargs):
+    return [float(text) for text in completions]
+
+
+# Looked at, not learned from
+
+
+def test_a_pause_changes_nothing_that_is_paid_later(tmp_path):
+    def fresh():
+        reward, rng = UncertaintyDiscountedReward(panel_of_texts()), np.random.default_rng(0)
+        for _ in range(20):
+            reward(["p"] * 8, ["".join(rng.choice(list("abcdeio"), rng.integers(1, 9))) for _ in range(8)])
+        return reward
+
+    plain, evaluated = fresh(), fresh()
+    long = {"prompts": ["q"] * 200, "completions": ["z" * 400] * 199 + ["a" * 400]}
+    with warnings.catch_warnings(), evaluated.paused():
+        warnings.simplefilter("ignore", AbsurdScoreWarning)
+        for _ in range(3):
+            assert np.isfinite(evaluated(**long)).all()
+    assert evaluated.tally == plain.tally
+    batch = {"prompts": ["p"] * 4, "completions": ["abc", "eee", "dddddd", "i"]}
+    assert evaluated(**batch) == plain(**batch)
+
+
+def panel_of_texts():
+    return {
+        "length": lambda completions, **_: [float(len(text)) for text in completions],
+        "vowels": lambda completions, **_: [float(sum(x in "aeiou" for x in text)) for text in completions],
+    }
+
+
+def test_a_reward_that_knows_nothing_yet_can_be_looked_at():
+    reward = UncertaintyDiscountedReward(panel([1, 3], [1, 3]))
+    with reward.paused():
+        assert ask(reward, 2) == pytest.approx([-1, 1])
+    assert reward.tally.completions == 0
+    assert reward.deviations == {"judge 0": 0, "judge 1": 0}
+
+
+# Odd questions
+
+
+def test_an_empty_batch():
+    assert UncertaintyDiscountedReward(panel([], []))([], []) == []
+
+
+@pytest.mark.parametrize(
+    ("prompts", "completions", "message"),
+    [
+        (["p"], ["a", "b"], "number of prompts = 1: must be 2, one per completion"),
+        (["p", "q", "r"], ["a", "b"], "number of prompts = 3"),
+        (["p", "q"], "ab", "completions = 'ab': must be a list with one entry per completion"),
+        ({"p": 1, "q": 2}, ["a", "b"], "prompts = "),
+        (None, ["a", "b"], "prompts = None"),
+    ],
+)
+def test_questions_that_fit_no_completions(prompts, completions, message):
+    reward = UncertaintyDiscountedReward(panel([1, 2], [1, 2]))
+    with pytest.raises(InvalidValueError, match=message):
+        reward(prompts, completions)
+    assert reward.tally.completions == 0
+
+
 # Bad judges
 
 
@@ -321,6 +496,21 @@ def nothing(**kwargs):
         ([broken, nothing], {"scales": [(0, 1), (0, 0)]}, r"scales\[1\]\[1\] = 0"),
         ([broken, nothing], {"scales": [(np.nan, 1), None]}, r"scales\[0\]\[0\] = nan"),
         ([broken, nothing], {"clip": 0}, "clip = 0"),
+        ([broken, nothing], {"clip": 1e7}, r"clip = .*in \(0, 1e\+06\]"),
+        ([broken, nothing], {"weights": "ab"}, "weights = 'ab': must be a list of 2, one per judge"),
+        ([broken, nothing], {"weights": {1, 2}}, "weights = "),
+        ([broken, nothing], {"weights": [1e308, 1e-308]}, "weights = .*none vanishes beside another"),
+        ([broken, nothing], {"weights": [1, "2"]}, r"weights\[1\] = '2'"),
+        ([broken, nothing], {"scales": [(0, 1), 3]}, r"scales\[1\] = 3: must be \(location, deviation\), or None"),
+        ([broken, nothing], {"scales": [(0, 1), (0, None)]}, r"scales\[1\]\[1\] = None"),
+        ([broken, nothing], {"scales": 1.0}, "scales = 1.0: must be a list of 2"),
+        ([broken, nothing], {"timeout": 0}, "timeout of judge 'broken' = 0: must be a finite number"),
+        ([broken, nothing], {"timeout": 1e300}, "timeout of judge 'broken' = 1e\\+300"),
+        ([broken, nothing], {"timeout": {"nothing": True}}, "timeout of judge 'nothing' = True"),
+        ([broken, nothing], {"timeout": {"nothin": 1}}, "did you mean 'nothing'"),
+        ([broken, nothing], {"timeout": {"sigma_m": 1}}, "name of a judge in timeout = 'sigma_m'"),
+        ([broken, nothing], {"name": "[b]"}, r"name = '\[b\]': must be a text of 1 to 100 printable"),
+        ([broken, nothing], {"mitigation": uard}, "mitigation = "),
         ([broken, nothing], {"sigma_m": 0.3}, "sigma_m = 0.3: must be a function"),
         ([broken, nothing], {"mitigation": named("uard-paper")}, "mitigation.acts_on = 'score'"),
     ],
@@ -503,10 +693,126 @@ def test_pickling_keeps_all_that_is_known():
     assert twin.tally == reward.tally
 
 
-def test_memory_belongs_to_its_judges():
-    memory = UncertaintyDiscountedReward(example.JUDGES).memory
-    with pytest.raises(InvalidValueError, match="those that the memory is of"):
-        UncertaintyDiscountedReward(example.JUDGES[:2]).memory = memory
+# The file that keeps it
+
+
+def learned(tmp_path, judges=3):
+    """A reward that has seen a batch, and the file that it has written."""
+    reward = UncertaintyDiscountedReward(example.JUDGES[:judges])
+    reward(prompts=["p"] * 4, completions=["sun rain", "wow wow wow", "um so", "storm wind sun"])
+    reward.save(tmp_path / "reward.json")
+    return reward, tmp_path / "reward.json"
+
+
+def test_a_file_keeps_all_that_is_known(tmp_path):
+    reward, file = learned(tmp_path)
+    twin = UncertaintyDiscountedReward(example.JUDGES)
+    twin.load(file)
+    for _ in range(3):
+        question = {"prompts": ["p"] * 4, "completions": ["snow", "wow", "like like", "sun sun"]}
+        assert twin(**question) == reward(**question)
+    assert twin.tally == reward.tally
+    assert twin.deviations == reward.deviations
+
+
+@pytest.mark.parametrize("seen", [[[0, 0, 9], [1, 2, 3]], [[None] * 3, [5, 5, 5]], None])
+def test_a_lone_score_and_an_empty_memory_are_kept(seen, tmp_path):
+    later = [1, 2, 3], [3, 2, 1]
+    reward = UncertaintyDiscountedReward({f"judge {k}": says(*([seen[k]] if seen else []), later[k]) for k in (0, 1)})
+    if seen:
+        ask(reward, 3)
+    reward.save(tmp_path / "reward.json")
+    twin = UncertaintyDiscountedReward(panel(*later))
+    twin.load(tmp_path / "reward.json")
+    assert ask(twin, 3) == ask(reward, 3)
+
+
+def test_given_scales_stay_when_a_file_is_read(tmp_path):
+    _, file = learned(tmp_path, judges=2)
+    reward = UncertaintyDiscountedReward(example.JUDGES[:2], scales=[(0.0, 3.0), None])
+    reward.load(file)
+    assert reward.deviations["relevance"] == 3
+    assert 0 < reward.deviations["clarity"] != 3
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b'"version": 1', b'"version": 2'),
+        (b'"relevance", ', b""),
+        (b'"mean": ', b'"mean": NaN, "x": '),
+        (b'"sd": ', b'"sd": -'),
+        (b'"completions": 4', b'"completions": -4'),
+        (b'"completions": 4', b'"completions": true'),
+        (b'"completions": 4', b'"completions": "4"'),
+        (b'"completions": 4, ', b""),
+        (b'"late"', b'"early"'),
+        (b'"rows": [[', b'"rows": [[1.0], ['),
+        (b'"rows": [[', b'"rows": [[1e999, '),
+        (b'"seen": 4', b'"seen": 5'),
+        (b'"PCG64"', b'"MT19937"'),
+        (b"{", b"[" * 10**5),
+        (b"}", b""),
+        (b'{"format"', b"\x80\x05cos\nsystem\n"),
+    ],
+)
+def test_a_file_that_is_damaged_or_of_others_is_refused_and_changes_nothing(old, new, tmp_path):
+    _, file = learned(tmp_path)
+    content = file.read_bytes()
+    assert old in content
+    file.write_bytes(content.replace(old, new))
+    (tmp_path / "other").mkdir()
+    reward, _ = learned(tmp_path / "other")
+    before, deviations = copy.deepcopy(reward.tally), reward.deviations
+    with pytest.raises(InvalidValueError, match=r"file of a reward = .*reward\.json.*: must be one that a reward of"):
+        reward.load(file)
+    assert (reward.tally, reward.deviations) == (before, deviations)
+
+
+@pytest.mark.parametrize("share", [0, 0.3, 0.9, 0.999])
+def test_a_truncated_file_is_refused(share, tmp_path):
+    _, file = learned(tmp_path)
+    content = file.read_bytes()
+    file.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(InvalidValueError, match="file of a reward"):
+        UncertaintyDiscountedReward(example.JUDGES).load(file)
+    with pytest.raises(InvalidValueError, match="No such file"):
+        UncertaintyDiscountedReward(example.JUDGES).load(tmp_path / "none.json")
+
+
+def test_a_file_of_other_judges_is_refused(tmp_path):
+    _, file = learned(tmp_path)
+    with pytest.raises(InvalidValueError, match=r"must be \['relevance', 'clarity'\], those of this reward"):
+        UncertaintyDiscountedReward(example.JUDGES[:2]).load(file)
+
+
+def test_saving_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
+    reward, file = learned(tmp_path)
+    before = file.read_bytes()
+    monkeypatch.setattr(os, "fsync", lambda descriptor: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(OSError, match="disk full"):
+        reward.save(file)
+    assert file.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [file]
+
+
+class Trap:
+    """What executes something when it is unpickled."""
+
+    def __reduce__(self):
+        return os.mkdir, ("executed",)
+
+
+def test_a_pickle_of_an_old_checkpoint_is_not_read(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "checkpoint-2"
+    folder.mkdir()
+    (folder / "uard_reward_0.pkl").write_bytes(pickle.dumps(Trap()))
+    args = GRPOConfig(output_dir=str(tmp_path), use_cpu=True, bf16=False)
+    callback = ReliabilityCallback(UncertaintyDiscountedReward(example.JUDGES))
+    with pytest.raises(InvalidValueError, match=r"uard_reward_0\.pkl.*must be uard_reward_0\.json; a pickle executes"):
+        callback.on_train_begin(args, TrainerState(global_step=2), TrainerControl())
+    assert not (tmp_path / "executed").exists()
 
 
 # Reward models
@@ -555,6 +861,28 @@ def test_a_model_with_heads_is_an_ensemble():
     assert (reward.last.sigma_m > 0).all()
     with pytest.raises(InvalidValueError, match="score 0 of judge 'reward_model'"):
         UncertaintyDiscountedReward([heads, example.clarity])(prompts=["describe "], completions=["sun"])
+
+
+def test_texts_that_a_reward_model_cannot_read_have_no_score():
+    model, tokenizer = classifier(1), example.tokenizer()
+    model.config.max_position_embeddings = 4
+    judge = RewardModel(model, tokenizer, batch_size=3)
+    prompts = ["", "describe ", "describe ", "describe ", ""]
+    scores = judge(prompts=prompts, completions=["", "sun", "sun sun sun sun", "sun sun sun", ""])
+    assert [score is None for score in scores] == [True, False, True, False, True]
+    assert scores[1] == pytest.approx(judge(prompts=["describe "], completions=["sun"])[0], abs=1e-6)
+    assert judge(prompts=[], completions=[]) == []
+    with pytest.raises(InvalidValueError, match="number of prompts = 1: must be 2"):
+        judge(prompts=[""], completions=["sun", "rain"])
+
+
+def test_a_reward_model_that_gives_nan_has_no_score():
+    model = classifier(1)
+    torch.nn.init.constant_(model.score.weight, torch.nan)
+    reward = UncertaintyDiscountedReward([RewardModel(model, example.tokenizer()), *example.JUDGES])
+    rewards = reward(prompts=["describe "] * 2, completions=["sun", "um wow"])
+    assert np.isfinite(rewards).all()
+    assert reward.tally.missing["reward_model"] == 2
 
 
 def test_a_bare_model_is_refused_with_advice():
@@ -661,7 +989,61 @@ def test_resuming_goes_on_with_what_was_known(tmp_path, caplog):
     resumed, _ = run(tmp_path / "a", resume=str(tmp_path / "a" / "checkpoint-2"), **saving)
     assert resumed.tally == whole.tally
     assert resumed.deviations == whole.deviations
-    (tmp_path / "a" / "checkpoint-2" / "uard_reward_0.pkl").unlink()
+    (tmp_path / "a" / "checkpoint-2" / "uard_reward_0.json").unlink()
     with pytest.warns(ForgottenWarning, match="resumed at step 2"):
         forgetful, _ = run(tmp_path / "a", resume=str(tmp_path / "a" / "checkpoint-2"), **saving)
     assert forgetful.tally.completions == 64
+
+
+@pytest.mark.parametrize(
+    ("trainer_class", "config"), [(GRPOTrainer, GRPOConfig), (RLOOTrainer, RLOOConfig)], ids=["grpo", "rloo"]
+)
+def test_an_evaluation_teaches_the_reward_nothing(trainer_class, config, tmp_path):
+    modes = []
+
+    def run(folder, **changes):
+        set_seed(0)
+        reward = UncertaintyDiscountedReward(example.JUDGES)
+        args = config(
+            output_dir=str(tmp_path / folder),
+            per_device_train_batch_size=8,
+            per_device_eval_batch_size=8,
+            num_generations=4,
+            max_completion_length=6,
+            max_steps=3,
+            beta=0.0,
+            report_to="none",
+            save_strategy="no",
+            logging_strategy="no",
+            disable_tqdm=True,
+            use_cpu=True,
+            bf16=False,
+            **changes,
+        )
+
+        def watch(completions, **kwargs):
+            modes.append(trainer.model.training)
+            return [0.0] * len(completions)
+
+        trainer = trainer_class(
+            model=example.language_model(0),
+            reward_funcs=[reward, watch],
+            args=args,
+            train_dataset=Dataset.from_dict({"prompt": example.PROMPTS * 4}),
+            eval_dataset=Dataset.from_dict({"prompt": example.PROMPTS}),
+            processing_class=example.tokenizer(),
+            callbacks=[ReliabilityCallback(reward)],
+        )
+        before = trainer.evaluate()  # before training, when nothing is known
+        assert reward.tally.completions == 0
+        trainer.train()
+        known = copy.deepcopy(reward.tally), reward.deviations
+        trainer.evaluate()
+        assert (reward.tally, reward.deviations) == known
+        assert np.isfinite(before["eval_reward"])
+        return reward
+
+    reward = run("a", eval_strategy="steps", eval_steps=1)
+    assert modes.count(True) == 3
+    assert modes.count(False) >= 5 * 2
+    assert reward.tally.completions == 3 * 8

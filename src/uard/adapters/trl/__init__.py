@@ -8,7 +8,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from uard.adapters.trl.advantages import advantage_change, groups_of, keeps_factor
-from uard.adapters.trl.reward import Judged, UncertaintyDiscountedReward, UnscoredWarning
+from uard.adapters.trl.memory import Tally
+from uard.adapters.trl.reward import (
+    AbsurdScoreWarning,
+    Judged,
+    LateJudgeWarning,
+    UncertaintyDiscountedReward,
+    UnscoredWarning,
+    UselessJudgeWarning,
+)
 from uard.adapters.trl.reward_model import RewardModel
 from uard.judges import JudgeError
 
@@ -17,18 +25,20 @@ if TYPE_CHECKING:
         DiscountCancelledWarning,
         ForgottenWarning,
         ReliabilityCallback,
-        UselessJudgeWarning,
     )
 
-_OF_CALLBACK = ("DiscountCancelledWarning", "ForgottenWarning", "ReliabilityCallback", "UselessJudgeWarning")
+_OF_CALLBACK = ("DiscountCancelledWarning", "ForgottenWarning", "ReliabilityCallback")
 
 __all__ = [
+    "AbsurdScoreWarning",
     "DiscountCancelledWarning",
     "ForgottenWarning",
     "JudgeError",
     "Judged",
+    "LateJudgeWarning",
     "ReliabilityCallback",
     "RewardModel",
+    "Tally",
     "UncertaintyDiscountedReward",
     "UnscoredWarning",
     "UselessJudgeWarning",

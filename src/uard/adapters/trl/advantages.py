@@ -93,3 +93,29 @@ def group_means(values: Float[np.ndarray, " B"], groups: Integer[np.ndarray, " B
     """
     total, known = np.bincount(groups, np.nan_to_num(values)), np.bincount(groups, ~np.isnan(values))
     return total / np.where(known > 0, known, np.nan)
+
+
+def told_apart(
+    scores: Float[np.ndarray, "B K"], groups: Integer[np.ndarray, " B"]
+) -> tuple[Integer[np.ndarray, " K"], Integer[np.ndarray, " K"]]:
+    """Count the groups of which each judge has scored two completions or more, and those in which its scores differ.
+
+    Examples:
+        >>> scores = np.array([[1.0, 5.0], [2.0, 5.0], [1.0, 7.0], [1.0, 7.0], [1.0, np.nan]])
+        >>> [counts.tolist() for counts in told_apart(scores, np.array([0, 0, 1, 1, 2]))]
+        [[2, 2], [1, 0]]
+
+    Args:
+        scores: NaN where one is missing.
+        groups: The number of each completion's group, from 0.
+    """
+    here, number = ~np.isnan(scores), int(groups[-1]) + 1 if len(groups) else 0
+    known, lowest = np.zeros((number, scores.shape[1]), int), np.full((number, scores.shape[1]), np.inf)
+    highest = -lowest
+    np.add.at(known, groups, here)
+    np.minimum.at(lowest, groups, np.where(here, scores, np.inf))
+    np.maximum.at(highest, groups, np.where(here, scores, -np.inf))
+    with np.errstate(over="ignore", invalid="ignore"):
+        differ = highest - lowest > EQUAL * np.maximum(abs(highest), abs(lowest))
+    compared = known >= 2
+    return compared.sum(0), (compared & differ).sum(0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import pickle
 import warnings
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ except ModuleNotFoundError as error:
 
 from uard import _checks
 from uard.adapters.trl.advantages import keeps_factor
-from uard.adapters.trl.reward import UncertaintyDiscountedReward
+from uard.adapters.trl.reward import UncertaintyDiscountedReward, UselessJudgeWarning
 
 log = logging.getLogger(__name__)
 
@@ -28,10 +27,6 @@ AGREED = 1e-6  # largest sigma_h, in standard deviations of a judge, at which ju
 
 class DiscountCancelledWarning(UserWarning):
     """Normalisation takes the discount out of the advantages again."""
-
-
-class UselessJudgeWarning(UserWarning):
-    """A judge cannot be compared with the others, or always agrees with them."""
 
 
 class ForgottenWarning(UserWarning):
@@ -44,7 +39,8 @@ class ReliabilityCallback(TrainerCallback):
     It warns of normalisation that cancels the discount (more than half of the groups that are discounted have nearly
     the same advantages without it, under this trainer's configuration), of a judge that never varies or never scores,
     of judges that never disagree, and of a reward that the trainer does not call. What the reward knows is kept in
-    every checkpoint and read again when training is resumed.
+    every checkpoint, as numbers, and read again when training is resumed. From completions of an evaluation it learns
+    nothing: the trainer's model is not in training mode then.
 
     Examples:
         >>> def length(completions, **question):
@@ -78,15 +74,27 @@ class ReliabilityCallback(TrainerCallback):
         self.patience = patience
         self._warned: set[str] = set()
 
-    def on_train_begin(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
-        """Log what this configuration leaves of the discount; if training is resumed, restore what the reward knew."""
+    def on_init_end(self, args: Any, state: Any, control: Any, model: Any = None, **kwargs: Any) -> None:
+        """Let the reward learn only while the trainer's model is in training mode."""
+        self.reward.follow(model)
+
+    def on_train_begin(self, args: Any, state: Any, control: Any, model: Any = None, **kwargs: Any) -> None:
+        """Log what this configuration leaves of the discount; if training is resumed, restore what the reward knew.
+
+        Raises:
+            InvalidValueError: what the checkpoint keeps is damaged or of other judges, or a pickle of version 0.1.
+        """
+        self.reward.follow(model)  # now it may be wrapped
         factor = "survives" if keeps_factor(args) else "is lost: advantages are divided by the deviation of their group"
         log.info("a weight that all completions of a prompt share %s", factor)
         if state.global_step == 0:
             return
         file = _file(args, state)
         if file.exists():
-            self.reward.memory = pickle.loads(file.read_bytes())
+            self.reward.load(file)
+        elif (old := file.with_suffix(".pkl")).exists():
+            allowed = f"{file.name}; a pickle executes what it holds and is not read: delete it to go on without"
+            raise _checks.InvalidValueError("what the reward knew", str(old), allowed)
         else:
             warnings.warn(
                 f"training is resumed at step {state.global_step}, but {file} does not exist: the judges' scales and "
@@ -99,7 +107,7 @@ class ReliabilityCallback(TrainerCallback):
         """Keep what the reward knows beside the checkpoint's other files."""
         file = _file(args, state)
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(pickle.dumps(self.reward.memory))
+        self.reward.save(file)
 
     def on_step_end(self, args: Any, state: Any, control: Any, **kwargs: Any) -> None:
         """Warn, if there is reason to."""
@@ -142,7 +150,11 @@ class ReliabilityCallback(TrainerCallback):
             f"discount if they are divided by the group's deviation, {tally.shifted} also if not",
         ]
         for name, deviation in self.reward.deviations.items():
-            lines.append(f"judge {name}: deviation {deviation:.3g}, {tally.missing[name]} scores missing")
+            line = f"judge {name}: deviation {deviation:.3g}, {tally.missing[name]} scores missing"
+            line += f", late for {tally.late[name]} batches" if tally.late[name] else ""
+            line += f", {tally.absurd[name]} absurd scores" if tally.absurd[name] else ""
+            line += ", never tells the completions of a prompt apart" if tally.never_tells_apart(name) else ""
+            lines.append(line)
         return "\n".join(lines)
 
     def _warn_of_judges(self) -> None:
@@ -167,4 +179,4 @@ class ReliabilityCallback(TrainerCallback):
 
 def _file(args: Any, state: Any) -> Path:
     folder = f"{PREFIX_CHECKPOINT_DIR}-{state.global_step}"
-    return Path(args.output_dir) / folder / f"uard_reward_{args.process_index}.pkl"
+    return Path(args.output_dir) / folder / f"uard_reward_{args.process_index}.json"

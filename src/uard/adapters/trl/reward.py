@@ -23,29 +23,54 @@ Nothing here imports TRL, transformers or torch before a model or the callback i
 
 from __future__ import annotations
 
+import copy
 import math
+import threading
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
 from uard import _checks
-from uard.adapters.trl.advantages import advantage_change, group_means, groups_of
-from uard.judges import Judge, Scale, as_scores, ask, by_name
+from uard.adapters.trl.advantages import advantage_change, group_means, groups_of, told_apart
+from uard.adapters.trl.memory import Memory, Tally
+from uard.judges import Answer, Judge, Scale, as_scores, ask, by_name, check_name
+from uard.judges.asking import is_listed
+from uard.judges.scales import ABSURD, Moments
 from uard.method.mitigations import Mitigation, uard
 from uard.ratings.stream import RewardStream
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Integer
 
+Doubt = tuple[str, type[UserWarning], str]  # what it is about, its kind, and what it says
+_Ensemble = np.ndarray | None  # sigma_m (B,), or the scores of its members (B, N)
+
 DISCOUNTED = 0.9  # a group whose mean weight is below this is discounted
 CANCELLED = 0.05  # and its discount cancelled, if the normalised advantages change by less than this
+ENOUGH_GROUPS = 16  # groups that a judge has compared before a verdict about it
+WIDEST_CLIP, WIDEST_SIGMA = 1e6, 1e12  # standard deviations; more would only overflow
+
+_OF_PROCESS = ("_lock", "_pauses", "_busy", "_model")  # what of a reward is not pickled
 
 
 class UnscoredWarning(UserWarning):
     """No judge scored a completion, so it teaches nothing."""
+
+
+class UselessJudgeWarning(UserWarning):
+    """A judge cannot be compared with the others, always agrees with them, or tells no advantages apart."""
+
+
+class LateJudgeWarning(UserWarning):
+    """A judge did not answer within its limit, so its scores are missing."""
+
+
+class AbsurdScoreWarning(UserWarning):
+    """A judge gave a score that is far beyond all its others."""
 
 
 class Judged(NamedTuple):
@@ -54,7 +79,7 @@ class Judged(NamedTuple):
     Attributes:
         scores: As the K judges gave them, in units of their own; NaN where one is missing.
         ratings: The same in standard deviations of each judge; NaN where a score is missing or its judge has given
-            nothing but this score so far.
+            nothing but this score so far, or has never told the completions of one prompt apart.
         raw: The proxy r: the judges' weighted mean, or the judge that was named as the proxy.
         reward: b + w (r - b): what is learned from.
         weight: w in [0, 1].
@@ -73,33 +98,6 @@ class Judged(NamedTuple):
     lam: Float[np.ndarray, " B"]
 
 
-@dataclass
-class Tally:
-    """Counts over all completions so far.
-
-    Attributes:
-        missing: How many each judge did not score.
-        completions: All of them.
-        unscored: How many no judge scored.
-        unchecked: How many were scored, but by fewer than two judges that tell completions apart.
-        weight: Sum of the weights of the scored ones.
-        widest: Largest sigma_h.
-        discounted: Groups with a mean weight below 0.9.
-        shifted: Of these, how many have nearly the same advantages without the discount.
-        cancelled: How many have if a group's advantages are divided by their standard deviation; those shifted too.
-    """
-
-    missing: dict[str, int]
-    completions: int = 0
-    unscored: int = 0
-    unchecked: int = 0
-    weight: float = 0.0
-    widest: float = 0.0
-    discounted: int = 0
-    shifted: int = 0
-    cancelled: int = 0
-
-
 class UncertaintyDiscountedReward:
     """Several judges as one reward function for TRL's GRPOTrainer and RLOOTrainer.
 
@@ -112,8 +110,12 @@ class UncertaintyDiscountedReward:
     be checked against and is believed as little as the mitigation believes unrated steps. One that no judge scored gets
     None, which TRL leaves out of training. All of this is counted in ``tally`` and logged.
 
-    Every call changes it; pickling keeps all that it knows. In distributed training each process has its own running
-    scales: give ``scales`` if groups are split over processes.
+    A judge that has never told the completions of one prompt apart is left out like one that always says the same: no
+    advantage can depend on it. From the first difference on it counts.
+
+    Every call changes it, except while it is ``paused`` or the model that it follows is evaluated; pickling keeps all
+    that it knows. What a call returns belongs to it, whatever other threads ask meanwhile. In distributed training each
+    process has its own running scales: give ``scales`` if groups are split over processes.
 
     Examples:
         >>> def length(completions, **question):
@@ -127,7 +129,7 @@ class UncertaintyDiscountedReward:
 
     Attributes:
         judges: The judges by name.
-        last: What became of the latest batch; None before the first.
+        last: What became of the latest batch, whichever thread asked about it; None before the first.
         tally: Counts over all batches.
     """
 
@@ -141,6 +143,7 @@ class UncertaintyDiscountedReward:
         sigma_m: Judge | None = None,
         mitigation: Mitigation | None = None,
         clip: float = 5.0,
+        timeout: float | Mapping[str, float] | None = None,
         name: str = "uard",
     ):
         """Take the judges.
@@ -158,8 +161,10 @@ class UncertaintyDiscountedReward:
                 standard deviations of a judge, or a row with the scores of N >= 2 members per completion.
             mitigation: What discounts; ``uard(prior_count=0)`` if left out: no completion comes twice, so its own
                 scores are all that will ever be known of it.
-            clip: Ratings are cut off at this many standard deviations, > 0.
-            name: What TRL and the logs call this reward.
+            clip: Ratings are cut off at this many standard deviations, in (0, 1e6].
+            timeout: Seconds > 0 that each judge has for a batch, or those of some by name; no limit if left out. What
+                is late is missing (of ``sigma_m``: 0). A synchronous judge with a limit runs in a thread of its own.
+            name: What TRL and the logs call this reward; like the judges' names printable and without brackets.
 
         Raises:
             InvalidValueError: for fewer than two judges (one never disagrees with itself and would be trusted
@@ -170,33 +175,87 @@ class UncertaintyDiscountedReward:
             raise _checks.InvalidValueError("sigma_m", sigma_m, "a function with the signature of a judge")
         if proxy is not None:
             _checks.choose("proxy", proxy, self.judges)
-        _checks.number("clip", clip, low=0, open_low=True)
+        _checks.number("clip", clip, low=0, high=WIDEST_CLIP, open_low=True)
+        check_name("name", name)
         self.last: Judged | None = None
-        self.tally = Tally(dict.fromkeys(self.judges, 0))
         self.__name__ = name
+        self._asked = self.judges if sigma_m is None else {**self.judges, "sigma_m": sigma_m}
+        self._limits = _limits(timeout, self._asked)
         self._weights = _weights(weights, len(self.judges))
-        self._scales = _scales(scales, len(self.judges))
-        self._members = Scale()
         self._proxy = None if proxy is None else list(self.judges).index(proxy)
-        self._sigma_m, self._clip = sigma_m, clip
-        self._stream = RewardStream(uard(prior_count=0.0) if mitigation is None else mitigation)
+        self._clip, self._warned = clip, set[str]()
+        stream = RewardStream(uard(prior_count=0.0) if mitigation is None else mitigation)
+        self._memory = Memory(Tally.of(self.judges), _scales(scales, len(self.judges)), Scale(), stream)
+        self._start()
+
+    def _start(self) -> None:
+        """Set up what belongs to this process and is not kept."""
+        self._lock, self._pauses = threading.Lock(), 0
+        self._busy: dict[str, Callable[[], bool]] = {}
+        self._model: Any = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what pickling keeps."""
+        return {name: value for name, value in vars(self).items() if name not in _OF_PROCESS}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take it up again."""
+        vars(self).update(state)
+        self._start()
+
+    @property
+    def tally(self) -> Tally:
+        """Counts over all batches that it has learned from."""
+        return self._memory.tally
 
     @property
     def deviations(self) -> dict[str, float]:
         """Standard deviation of each judge's scores; 0 for one that has never varied."""
-        return {name: scale.deviation for name, scale in zip(self.judges, self._scales, strict=True)}
+        return {name: scale.deviation for name, scale in zip(self.judges, self._memory.scales, strict=True)}
 
-    @property
-    def memory(self) -> Any:
-        """All that it has learned from completions, to be pickled and set again; the judges are not in it."""
-        return self.tally, self._scales, self._members, self._stream
+    @contextmanager
+    def paused(self) -> Generator[None]:
+        """Learn nothing from completions meanwhile: scales, tally and mean disagreement stay as they are.
 
-    @memory.setter
-    def memory(self, memory: Any) -> None:
-        names = list(memory[0].missing)
-        if names != list(self.judges):
-            raise _checks.InvalidValueError("judges", list(self.judges), f"{names}, those that the memory is of")
-        self.tally, self._scales, self._members, self._stream = memory
+        Examples:
+            >>> reward = UncertaintyDiscountedReward({"a": lambda **_: [1, 2], "b": lambda **_: [1, 2]})
+            >>> with reward.paused():
+            ...     looked_at = reward(["why?"] * 2, ["so", "therefore"])
+            >>> reward.tally.completions
+            0
+        """
+        with self._lock:
+            self._pauses += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._pauses -= 1
+
+    def follow(self, model: Any) -> None:
+        """Learn nothing from completions while a model is not in training mode (``model.training``), as in evaluation.
+
+        ``ReliabilityCallback`` calls this with the trainer's model.
+        """
+        self._model = model
+
+    def save(self, path: str | Path) -> None:
+        """Write all that it has learned from completions to a file, as numbers; the judges are not in it.
+
+        Args:
+            path: The file is whole at any time; its folder must be there.
+        """
+        with self._lock:
+            self._memory.save(path)
+
+    def load(self, path: str | Path) -> None:
+        """Go on with what ``save`` has written; nothing in the file is executed. Fixed scales stay as they are given.
+
+        Raises:
+            InvalidValueError: naming the file, if it is not such a file, is damaged, or is of other judges.
+        """
+        with self._lock:
+            self._memory.load(path)
 
     def __call__(
         self,
@@ -219,61 +278,76 @@ class UncertaintyDiscountedReward:
 
         Raises:
             JudgeError: if a judge raises.
-            InvalidValueError: if a judge gives the wrong number of scores, or one that is no finite number.
+            InvalidValueError: if there is not one prompt per completion, or a judge gives the wrong number of scores,
+                or one that is no finite number.
 
         Warns:
             UnscoredWarning: the first time that no judge scores a completion.
+            LateJudgeWarning: the first time that a judge is late.
+            AbsurdScoreWarning: the first time that a judge gives a score far beyond all its others.
+            UselessJudgeWarning: once a judge has scored 16 groups and told the completions of none apart.
         """
-        asked = self.judges if self._sigma_m is None else {**self.judges, "sigma_m": self._sigma_m}
+        prompts, completions = _listed("prompts", prompts), _listed("completions", completions)
+        size = len(completions)
+        if len(prompts) != size:
+            raise _checks.InvalidValueError("number of prompts", len(prompts), f"{size}, one per completion")
+        if size == 0:
+            return []
+        learning = self._pauses == 0 and getattr(self._model, "training", True)
         question = {"prompts": prompts, "completions": completions, "completion_ids": completion_ids}
-        answers = ask(asked, {**question, "log_extra": log_extra, "log_metric": log_metric, **columns})
-        scores = np.stack([as_scores(name, answers[name], len(completions)) for name in self.judges], axis=1)
-        sigma_m = self._ensemble(answers, len(completions))
-        self.last = self._discount(scores, sigma_m)
-        self._count(self.last)
+        question |= {"log_extra": log_extra, "log_metric": log_metric, **columns}
+        answers = ask(self._asked, question, self._limits, self._busy)
+        columns_of = [_scores(name, answers[name], size) for name in self.judges]
+        scores, ensemble = np.stack(columns_of, axis=1), _ensemble(answers.get("sigma_m"), size)
         groups = groups_of(prompts)
-        change = advantage_change(self.last.raw, self.last.reward, groups)
-        self._count_groups(self.last, groups, change)
+        with self._lock:
+            memory = self._memory if learning else copy.deepcopy(self._memory)
+            absurd = _observe(memory, scores, ensemble, groups)
+            self.last = judged = self._discount(memory, scores, ensemble)
+            change = advantage_change(judged.raw, judged.reward, groups)
+            _count(memory.tally, judged, groups, change)
+            doubts = [*_doubts(memory, judged, absurd), *self._late(memory, answers, size)]
+            new = {message: kind for key, kind, message in doubts if key not in self._warned}
+            self._warned |= {key for key, _, _ in doubts}
         if log_extra is not None:
-            self._log_completions(self.last, log_extra)
+            self._log_completions(judged, log_extra)
         if log_metric is not None:
-            self._log_means(self.last, change, log_metric)
-        return [None if math.isnan(reward) else reward for reward in self.last.reward.tolist()]
+            self._log_means(judged, change, answers, log_metric)
+        for message, kind in new.items():
+            warnings.warn(message, kind, stacklevel=2)
+        return [None if math.isnan(reward) else reward for reward in judged.reward.tolist()]
 
-    def _ensemble(self, answers: dict[str, Any], size: int) -> Float[np.ndarray, " B"]:
-        """Return sigma_m from what the ensemble answered, if there is one."""
-        if self._sigma_m is None:
-            return np.zeros(size)
-        values = _checks.as_numpy("sigma_m", answers["sigma_m"])
-        if values.shape == (size,):
-            _checks.nonnegative("sigma_m", values)
-            return values
-        if values.ndim != 2 or len(values) != size or values.shape[1] < 2:
-            allowed = f"({size},) or ({size}, N) with N >= 2 members"
-            raise _checks.InvalidValueError("shape of the answer of sigma_m", values.shape, allowed)
-        _checks.finite("sigma_m", values)
-        self._members.observe(values)
-        return np.std(values, axis=1, ddof=1) / (self._members.deviation or 1.0)
-
-    def _discount(self, scores: Float[np.ndarray, "B K"], sigma_m: Float[np.ndarray, " B"]) -> Judged:
-        here = ~np.isnan(scores)
-        for judge, scale in enumerate(self._scales):
-            scale.observe(scores[here[:, judge], judge])
-        rated = np.stack([scale.ratings(column) for scale, column in zip(self._scales, scores.T, strict=True)], 1)
-        ratings = np.clip(rated, -self._clip, self._clip)
+    def _discount(self, memory: Memory, scores: Float[np.ndarray, "B K"], ensemble: _Ensemble) -> Judged:
+        rated = [scale.ratings(column) for scale, column in zip(memory.scales, scores.T, strict=True)]
+        ratings = np.clip(np.stack(rated, axis=1), -self._clip, self._clip)
+        ratings[:, [memory.tally.never_tells_apart(name) for name in self.judges]] = np.nan
         raw = self._combine(ratings)
-        scored = here.any(1)
+        scored = (~np.isnan(scores)).any(1)
         checked = (~np.isnan(ratings)).sum(1, keepdims=True) >= 2
-        filtered = self._stream(raw[scored], np.where(checked, ratings, np.nan)[scored], sigma_m[scored])
+        sigma_m = _disagreement(ensemble, memory.members, len(scores))
+        f = memory.stream(raw[scored], np.where(checked, ratings, np.nan)[scored], sigma_m[scored])
 
         def whole(values: Float[np.ndarray, " scored"]) -> Float[np.ndarray, " B"]:
             column = np.full(len(scores), np.nan)
             column[scored] = values
             return column
 
-        f = filtered
         columns = (f.raw, f.reward, f.weight, f.sigma_h, f.sigma_m, f.lam)
         return Judged._make([scores, ratings, *map(whole, columns)])
+
+    def _late(self, memory: Memory, answers: Mapping[str, Answer], size: int) -> Iterator[Doubt]:
+        """Count the judges that did not answer in time, and say who they are."""
+        for name, answer in answers.items():
+            if not answer.late:
+                continue
+            memory.tally.late[name] += 1
+            lost = "its disagreement counts as 0 for" if name == "sigma_m" else "its scores are missing for"
+            yield (
+                f"late {name}",
+                LateJudgeWarning,
+                f"judge {name!r} did not answer within {self._limits[name]:g} s: {lost} these {size} completions, and "
+                "it is not asked again while it is still at work. Counted in tally.late from now on",
+            )
 
     def _combine(self, ratings: Float[np.ndarray, "B K"]) -> Float[np.ndarray, " B"]:
         """Return the proxy; 0, the mean of all completions so far, where no judge tells completions apart."""
@@ -282,33 +356,6 @@ class UncertaintyDiscountedReward:
         mean = np.where(here, ratings, 0.0) @ self._weights / np.where(total > 0, total, 1.0)
         return mean if self._proxy is None else np.where(here[:, self._proxy], ratings[:, self._proxy], mean)
 
-    def _count(self, judged: Judged) -> None:
-        tally, missing = self.tally, np.isnan(judged.scores)
-        unscored = missing.all(1)
-        if unscored.any() and not tally.unscored:
-            warnings.warn(
-                f"no judge scored completion {int(np.argmax(unscored))} ({unscored.sum()} of {unscored.size} in this "
-                "batch): they get no reward and teach nothing. Counted in tally.unscored from now on",
-                UnscoredWarning,
-                stacklevel=3,
-            )
-        for name, number in zip(self.judges, missing.sum(0).tolist(), strict=True):
-            tally.missing[name] += number
-        tally.completions += unscored.size
-        tally.unscored += int(unscored.sum())
-        tally.unchecked += int(((~np.isnan(judged.ratings)).sum(1) < 2)[~unscored].sum())
-        tally.weight += float(np.nansum(judged.weight))
-        tally.widest = float(np.max(judged.sigma_h, initial=tally.widest, where=~unscored))
-
-    def _count_groups(
-        self, judged: Judged, groups: Integer[np.ndarray, " B"], change: Float[np.ndarray, " groups"]
-    ) -> None:
-        discounted = ~np.isnan(change) & (group_means(judged.weight, groups) < DISCOUNTED)
-        undivided = advantage_change(judged.raw, judged.reward, groups, divided=False)
-        self.tally.discounted += int(discounted.sum())
-        self.tally.shifted += int((discounted & (undivided < CANCELLED)).sum())
-        self.tally.cancelled += int((discounted & (change < CANCELLED)).sum())
-
     def _log_completions(self, judged: Judged, log_extra: Callable[[str, list[Any]], None]) -> None:
         columns = {name: judged.scores[:, k] for k, name in enumerate(self.judges)}
         columns |= {name: getattr(judged, name) for name in ("raw", "weight", "sigma_h", "sigma_m")}
@@ -316,11 +363,16 @@ class UncertaintyDiscountedReward:
             log_extra(f"{self.__name__}/{name}", [None if math.isnan(x) else x for x in values.tolist()])
 
     def _log_means(
-        self, judged: Judged, change: Float[np.ndarray, " groups"], log_metric: Callable[[str, float], None]
+        self,
+        judged: Judged,
+        change: Float[np.ndarray, " groups"],
+        answers: Mapping[str, Answer],
+        log_metric: Callable[[str, float], None],
     ) -> None:
         missing = np.isnan(judged.scores)
         values = {f"{name}/missing": missing[:, k].mean() for k, name in enumerate(self.judges)}
         values |= {f"{name}/mean": _mean(judged.scores[:, k]) for k, name in enumerate(self.judges)}
+        values |= {f"{name}/seconds": answer.seconds for name, answer in answers.items()}
         values |= {name: _mean(getattr(judged, name)) for name in ("raw", "weight", "sigma_h", "sigma_m", "lam")}
         values |= {"unscored": missing.all(1).mean(), "advantage_change": _mean(change)}
         for name, value in values.items():
@@ -328,31 +380,158 @@ class UncertaintyDiscountedReward:
                 log_metric(f"{self.__name__}/{name}", float(value))
 
 
+def _observe(
+    memory: Memory, scores: Float[np.ndarray, "B K"], ensemble: _Ensemble, groups: Integer[np.ndarray, " B"]
+) -> dict[str, float]:
+    """Take a batch into the scales and count who tells completions apart; return one absurd score of each judge."""
+    absurd: dict[str, float] = {}
+    compared, told = told_apart(scores, groups)
+    for k, (name, scale) in enumerate(zip(memory.tally.missing, memory.scales, strict=True)):
+        found = scale.observe(scores[~np.isnan(scores[:, k]), k])
+        memory.tally.absurd[name] += found.size
+        memory.tally.compared[name] += int(compared[k])
+        memory.tally.told_apart[name] += int(told[k])
+        if found.size:
+            absurd[name] = float(found[0])
+    if ensemble is not None and ensemble.ndim == 2:
+        memory.members.observe(ensemble)
+    return absurd
+
+
+def _count(
+    tally: Tally, judged: Judged, groups: Integer[np.ndarray, " B"], change: Float[np.ndarray, " groups"]
+) -> None:
+    missing = np.isnan(judged.scores)
+    unscored = missing.all(1)
+    for name, number in zip(tally.missing, missing.sum(0).tolist(), strict=True):
+        tally.missing[name] += number
+    tally.completions += unscored.size
+    tally.unscored += int(unscored.sum())
+    tally.unchecked += int(((~np.isnan(judged.ratings)).sum(1) < 2)[~unscored].sum())
+    tally.weight += float(np.nansum(judged.weight))
+    tally.widest = float(np.max(judged.sigma_h, initial=tally.widest, where=~unscored))
+    discounted = ~np.isnan(change) & (group_means(judged.weight, groups) < DISCOUNTED)
+    undivided = advantage_change(judged.raw, judged.reward, groups, divided=False)
+    tally.discounted += int(discounted.sum())
+    tally.shifted += int((discounted & (undivided < CANCELLED)).sum())
+    tally.cancelled += int((discounted & (change < CANCELLED)).sum())
+
+
+def _doubts(memory: Memory, judged: Judged, absurd: Mapping[str, float]) -> Iterator[Doubt]:
+    """Say what is wrong with the judges."""
+    unscored = np.isnan(judged.scores).all(1)
+    if unscored.any():
+        yield (
+            "unscored",
+            UnscoredWarning,
+            f"no judge scored completion {int(np.argmax(unscored))} ({unscored.sum()} of {unscored.size} in this "
+            "batch): they get no reward and teach nothing. Counted in tally.unscored from now on",
+        )
+    for name, score in absurd.items():
+        yield (
+            f"absurd {name}",
+            AbsurdScoreWarning,
+            f"judge {name!r} gave the score {score:g}, more than {ABSURD:g} of its standard deviations from its mean: "
+            "a mistake? Its rating is cut off, and it hardly moves a running scale. Counted in tally.absurd from now "
+            "on",
+        )
+    for name, scale in zip(memory.tally.missing, memory.scales, strict=True):
+        groups = memory.tally.compared[name]
+        if groups >= ENOUGH_GROUPS and memory.tally.never_tells_apart(name) and scale.deviation > 0:
+            yield (
+                f"apart {name}",
+                UselessJudgeWarning,
+                f"judge {name!r} has scored {groups} groups and told the completions of none apart: does it score the "
+                "prompt? No advantage depends on it, and it is left out until it does",
+            )
+
+
+def _scores(name: str, answer: Answer, size: int) -> Float[np.ndarray, " B"]:
+    return np.full(size, np.nan) if answer.late else as_scores(name, answer.given, size)
+
+
+def _ensemble(answer: Answer | None, size: int) -> _Ensemble:
+    """Return what the ensemble answered; None if there is none or it is late."""
+    if answer is None or answer.late:
+        return None
+    values = _checks.as_numpy("sigma_m", answer.given)
+    if values.shape == (size,):
+        _checks.nonnegative("sigma_m", values)
+        return values
+    if values.ndim != 2 or len(values) != size or values.shape[1] < 2:
+        allowed = f"({size},) or ({size}, N) with N >= 2 members"
+        raise _checks.InvalidValueError("shape of the answer of sigma_m", values.shape, allowed)
+    _checks.finite("sigma_m", values)
+    return values
+
+
+def _disagreement(ensemble: _Ensemble, members: Scale, size: int) -> Float[np.ndarray, " B"]:
+    """Return sigma_m in standard deviations of a judge."""
+    if ensemble is None or (ensemble.ndim == 2 and members.deviation == 0):
+        return np.zeros(size)
+    if ensemble.ndim == 1:
+        return np.clip(ensemble, 0.0, WIDEST_SIGMA)
+    return np.std(np.clip(members.ratings(ensemble), -WIDEST_SIGMA, WIDEST_SIGMA), axis=1, ddof=1)
+
+
 def _mean(values: Float[np.ndarray, " n"]) -> float:
     known = values[~np.isnan(values)]
-    return float(known.mean()) if known.size else math.nan
+    return float((known / known.size).sum()) if known.size else math.nan
+
+
+def _listed(field: str, values: Any) -> list[Any]:
+    if not is_listed(values):
+        raise _checks.InvalidValueError(field, values, "a list with one entry per completion")
+    return list(values)
+
+
+def _limits(timeout: Any, asked: Mapping[str, Judge]) -> dict[str, float]:
+    if timeout is None:
+        return {}
+    given: dict[str, Any] = dict.fromkeys(asked, timeout)
+    if isinstance(timeout, Mapping):
+        given = dict(cast("Mapping[str, Any]", timeout))
+    for name, seconds in given.items():
+        _checks.choose("name of a judge in timeout", name, asked)
+        _checks.number(f"timeout of judge {name!r}", seconds, low=0, high=threading.TIMEOUT_MAX, open_low=True)
+    return {name: float(seconds) for name, seconds in given.items()}
+
+
+def _of_each(field: str, values: Any, number: int) -> list[Any]:
+    """Return a list with an entry for each judge."""
+    allowed = f"{number}, one per judge"
+    if not is_listed(values):
+        raise _checks.InvalidValueError(field, values, f"a list of {allowed}")
+    if len(values) != number:
+        raise _checks.InvalidValueError(f"len({field})", len(values), allowed)
+    return list(values)
 
 
 def _weights(weights: Sequence[float] | None, number: int) -> Float[np.ndarray, " K"]:
     if weights is None:
         return np.ones(number)
-    if len(weights) != number:
-        raise _checks.InvalidValueError("len(weights)", len(weights), f"{number}, one per judge")
-    for judge, weight in enumerate(weights):
+    given = _of_each("weights", weights, number)
+    for judge, weight in enumerate(given):
         _checks.number(f"weights[{judge}]", weight, low=0, open_low=True)
-    return np.array(weights, np.float64)
+    shares = np.array([float(weight) for weight in given]) / max(given)
+    if not shares.all():
+        raise _checks.InvalidValueError("weights", weights, "numbers of which none vanishes beside another")
+    return shares
 
 
 def _scales(scales: Sequence[tuple[float, float] | None] | None, number: int) -> list[Scale]:
     if scales is None:
         return [Scale() for _ in range(number)]
-    if len(scales) != number:
-        raise _checks.InvalidValueError("len(scales)", len(scales), f"{number}, one per judge")
-    made: list[Scale] = []
-    for judge, pair in enumerate(scales):
-        location, deviation = (0.0, None) if pair is None else pair
-        _checks.number(f"scales[{judge}][0]", location)
-        if deviation is not None:
-            _checks.number(f"scales[{judge}][1]", deviation, low=0, open_low=True)
-        made.append(Scale(location=location, fixed=deviation))
-    return made
+    return [_scale(f"scales[{judge}]", pair) for judge, pair in enumerate(_of_each("scales", scales, number))]
+
+
+def _scale(field: str, pair: Any) -> Scale:
+    if pair is None:
+        return Scale()
+    try:
+        location, deviation = pair
+    except (TypeError, ValueError):
+        raise _checks.InvalidValueError(field, pair, "(location, deviation), or None for the running one") from None
+    _checks.number(f"{field}[0]", location)
+    _checks.number(f"{field}[1]", deviation, low=0, open_low=True)
+    return Scale(Moments(mean=float(location)), fixed=float(deviation))
