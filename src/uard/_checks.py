@@ -139,14 +139,18 @@ def finite(field: str, values: Any) -> None:
 
 def moderate(field: str, values: Any) -> None:
     """Check that an array holds no NaN and nothing above ``LARGEST`` (``LARGEST_SINGLE``); traced arrays pass."""
-    if type(values) is np.ndarray and values.dtype == np.float64 and values.size > 0:
-        if np.maximum.reduce(values, None) <= LARGEST and np.minimum.reduce(values, None) >= -LARGEST:
-            return
-    elif is_traced(values):
+    if is_small(values) or is_traced(values):
         return
     limit = largest(values)
     _check_all(field, values, np.isfinite, "finite (no NaN, no infinity)")
     _check_all(field, values, lambda x: np.abs(x) <= limit, f"in [-{limit:g}, {limit:g}], or its square overflows")
+
+
+def is_small(values: Any) -> bool:
+    """Whether ``values`` is an array of doubles that surely pass ``moderate``: the usual case, in one operation."""
+    if type(values) is not np.ndarray or values.dtype.char != "d":
+        return False
+    return bool(np.vdot(values, values) <= LARGEST * LARGEST)
 
 
 def largest(values: Any) -> float:
@@ -197,6 +201,8 @@ def as_numpy(field: str, values: Any) -> np.ndarray:
     Raises:
         InvalidValueError: for all else: text, ``None``, complex numbers, decimals, dictionaries, sets, generators.
     """
+    if type(values) is np.ndarray and values.dtype.char == "d":
+        return values
     try:
         try:
             return _floats(values)

@@ -54,7 +54,7 @@ def as_floats(field: str, array: Array) -> Array:
         InvalidValueError: naming ``field``: it holds something else (text, objects, complex numbers), or is a masked
             array, whose mask would be lost.
     """
-    if type(array) is np.ndarray and (array.dtype == np.float64 or array.dtype == np.float32):
+    if type(array) is np.ndarray and array.dtype.char in "df":
         return array  # nearly always
     xp = namespace(array)
     if isinstance(array, np.ma.MaskedArray) or not xp.isdtype(array.dtype, ("bool", "integral", "real floating")):

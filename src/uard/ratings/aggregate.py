@@ -58,7 +58,7 @@ def aggregate(
         _checks.same_shape("mask", mask, "ratings", ratings)
         if not namespace(mask).isdtype(mask.dtype, "bool"):
             raise _checks.InvalidValueError("mask.dtype", mask.dtype, "truth values: True where a rating exists")
-    elif not _checks.is_traced(ratings):
+    elif not (_checks.is_small(ratings) or _checks.is_traced(ratings)):
         small = abs(ratings) <= _checks.largest(ratings)  # which NaN is not
         if not small.all():
             mask = ratings == ratings

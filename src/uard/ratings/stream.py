@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 PATIENCE = 1000  # steps without any rating before we say so
 MAX_RATERS = 1000  # what is kept of a step grows with the widest panel
+MAX_KEYS = 100_000  # of a stream that is told nothing else
 SHARE = 8  # statistics over n keys are measured after n / SHARE rated steps at the earliest: a step costs the same
 
 
@@ -114,7 +115,7 @@ class RewardStream:
         ddof: int = 0,
         capacity: int = 4096,
         refresh: int = 256,
-        max_keys: int = 100_000,
+        max_keys: int = MAX_KEYS,
         seed: int = 0,
     ):
         """Start without any rating.
@@ -262,19 +263,19 @@ class RewardStream:
         Raises:
             InvalidValueError: naming field, place, value and what is allowed.
         """
-        return self._filter(_column("reward", reward), known, sigma_m, keyed, known.count > 0)
+        reward = _column("reward", reward)
+        _checks.same_shape("known.count", known.count, "reward", reward)
+        return self._filter(reward, known, self._sigma_m(sigma_m, len(reward)), keyed, known.count > 0)
 
     def _filter(
         self,
         reward: Float[np.ndarray, " B"],
         known: Feedback,
-        sigma_m: Any,
+        sigma_m: Float[np.ndarray, " B"],
         keyed: bool,
         rated: Bool[np.ndarray, " B"],
     ) -> Filtered:
         zeros = np.zeros(len(reward))
-        _checks.same_shape("known.count", known.count, "reward", reward)
-        sigma_m = self._sigma_m(sigma_m, len(reward))
         mitigation = self.mitigation if keyed else self._of_single_visits
         with np.errstate(over="ignore"):  # a weight may be one over infinity; what is learned is checked
             why = mitigation.explain(Evidence(reward, sigma_m, known), self._measured(keyed))
@@ -409,7 +410,7 @@ def _explained(mitigation: Mitigation, why: Any, zeros: Float[np.ndarray, " B"])
             allowed = f"{zeros.shape}, one per step"
             raise _checks.InvalidValueError(f"{name}.explain(...).{field}.shape", values.shape, allowed)
         columns.append(values + zeros)
-    if np.isnan(columns[1] + columns[2] + columns[3]).any():
+    if np.isnan(np.add.reduce(columns[1] + columns[2] + columns[3])):
         _checks.finite(f"{name}.explain(...)", np.stack(columns[1:]))
     return columns
 
