@@ -56,7 +56,7 @@ def _refuse_wrapped(env: Any) -> None:
         allowed = "environments without one: rewards would be filtered twice"
         raise _checks.InvalidValueError("env", type(env).__name__, allowed)
     if isinstance(env, gymnasium.Wrapper | gymnasium.vector.VectorWrapper):
-        _refuse_wrapped(env.env)
+        _refuse_wrapped(cast("Any", env).env)
     elif isinstance(env, gymnasium.vector.SyncVectorEnv):
         for one in cast("Any", env).envs:
             _refuse_wrapped(one)

@@ -250,10 +250,8 @@ class ReliabilityReplayBuffer(ReplayBuffer):
         """
         space = arguments[1] if len(arguments) > 1 else options.get("observation_space")
         if isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple):
-            allowed = (
-                "one of arrays: flatten the observations (gymnasium's FlattenObservation), or wrap the environments"
-            )
-            raise _checks.InvalidValueError("observation_space", space, f"{allowed} in a ReliabilityVecEnv")
+            allowed = "of arrays: put gymnasium's FlattenObservation around the environment, or use ReliabilityVecEnv"
+            raise _checks.InvalidValueError("observation_space", cast("object", space), allowed)
         cast("Any", super()).__init__(*arguments, **options)
         spaces: Any = self
         key = key or natural_key(spaces.observation_space, spaces.action_space)

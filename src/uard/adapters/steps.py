@@ -191,9 +191,10 @@ def with_row(batch: Any, i: Any, row: Any) -> Any:
 
 def _ratings_row(field: str, entry: Any) -> Float[np.ndarray, " K"]:
     allowed = "a row of K finite numbers (None or NaN is a missing one)"
-    listed = isinstance(entry, list | tuple) or getattr(getattr(entry, "dtype", None), "kind", "") == "O"
+    given: Any = entry
     try:
-        given: Any = [np.nan if x is None else x for x in cast("Any", entry)] if listed else entry
+        if isinstance(entry, list | tuple) or getattr(getattr(given, "dtype", None), "kind", "") == "O":
+            given = [np.nan if x is None else x for x in given]
         row = _checks.as_numpy(field, given)
     except (TypeError, _checks.InvalidValueError):  # an array of objects may have no dimensions
         raise _checks.InvalidValueError(field, cast("object", entry), allowed) from None

@@ -352,7 +352,8 @@ class RewardStream:
             kept = state.mitigation_of(plain["mitigation"])
             kind = str(plain["mitigation"]["kind"])
         except state.BROKEN as error:
-            raise _checks.InvalidValueError("path", str(path), f"{allowed}: {error}") from None
+            why = "" if "allow_pickle" in str(error) else f": {error}"  # do not say how to execute it
+            raise _checks.InvalidValueError("path", str(path), f"{allowed}{why}") from None
         if mitigation is None and kept is None:
             raise _checks.InvalidValueError("mitigation", None, f"given: the file's, {kind}, is not one of uard's own")
         mitigation = kept if mitigation is None else mitigation

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from uard import plugins
+from uard import _checks, plugins
 from uard.method.mitigations.baselines import RatedReward, Raw, Screening
 from uard.method.mitigations.discounting import uard, uard_paper
 from uard.method.mitigations.protocol import Mitigation
@@ -46,10 +46,15 @@ def named(name: str, **parameters: Any) -> Mitigation:
 
     Raises:
         UnknownNameError: with the nearest name.
+        InvalidValueError: it has no such parameter, or a value is not allowed.
         PluginError: a plugin that cannot be used.
     """
+    _checks.instance("mitigation", name, str, "a name")
     if name in NAMED:
-        return NAMED[name](**parameters)
+        try:
+            return NAMED[name](**parameters)
+        except TypeError as error:  # ours raise no other
+            raise _checks.InvalidValueError(f"parameters of {name!r}", parameters, f"its fields ({error})") from None
     return plugins.pick("mitigation", name, NAMED, [*NAMED]).load(is_mitigation)(**parameters)
 
 
