@@ -6,11 +6,16 @@ import difflib
 import math
 import sys
 from collections.abc import Iterable, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 T = TypeVar("T")
+
+LARGEST = 1e100
+"""What a reward, a rating or a disagreement may be at most, so that squares and sums of squares are numbers too."""
+LARGEST_SINGLE = 1e15
+"""The same where numbers are held in single precision."""
 
 
 class InvalidValueError(ValueError):
@@ -64,7 +69,7 @@ def choose(field: str, value: str, known: Iterable[str]) -> str:
         UnknownNameError: with the nearest known name.
     """
     names = list(known)
-    if value not in names:
+    if not isinstance(value, str) or value not in names:  # "in" would compare an array place by place
         raise UnknownNameError(field, value, names)
     return value
 
@@ -101,6 +106,12 @@ def number(
         raise InvalidValueError(field, value, _interval("a finite number", low, high, open_low))
 
 
+def truth(field: str, value: object) -> None:
+    """Check that ``value`` is true or false; text and numbers would count as true."""
+    if not isinstance(value, bool | np.bool_):
+        raise InvalidValueError(field, value, "true or false")
+
+
 def _plain(value: Any) -> Any:
     return value.item() if getattr(value, "shape", None) == () else value
 
@@ -135,6 +146,42 @@ def finite(field: str, values: Any) -> None:
     _check_all(field, values, lambda x: np.isfinite(x), "finite (no NaN, no infinity)")
 
 
+def moderate(field: str, values: Any) -> None:
+    """Check that an array holds no NaN and nothing above ``LARGEST`` (``LARGEST_SINGLE``); traced arrays pass."""
+    if is_small(values) or is_traced(values):
+        return
+    limit = largest(values)
+    _check_all(field, values, np.isfinite, "finite (no NaN, no infinity)")
+    _check_all(field, values, lambda x: np.abs(x) <= limit, f"in [-{limit:g}, {limit:g}], or its square overflows")
+
+
+def is_small(values: Any) -> bool:
+    """Whether ``values`` is an array of doubles that surely pass ``moderate``: the usual case, in one operation."""
+    if type(values) is not np.ndarray or values.dtype.char != "d":
+        return False
+    return bool(np.vdot(values, values) <= LARGEST * LARGEST)
+
+
+def largest(values: Any) -> float:
+    """Return how large the numbers of an array may be, by the size of its items in bytes."""
+    return LARGEST if getattr(getattr(values, "dtype", None), "itemsize", 8) > 4 else LARGEST_SINGLE
+
+
+def fitting(field: str, values: np.ndarray, dtype: Any) -> np.ndarray:
+    """Return finite numbers in another precision.
+
+    Raises:
+        InvalidValueError: one of them does not fit, and would become infinite.
+    """
+    with np.errstate(over="ignore"):
+        cast = values.astype(dtype)
+    if not np.isfinite(cast).all():
+        kind = np.dtype(dtype)
+        allowed = f"in [-{np.finfo(kind).max:g}, {np.finfo(kind).max:g}], for it leaves as {kind}"
+        _check_all(field, values, lambda _: np.isfinite(cast), allowed)
+    return cast
+
+
 def nonnegative(field: str, values: Any) -> None:
     """Check that an array is finite and nowhere negative; traced arrays pass."""
     plain = type(values) is np.ndarray and values.dtype == np.float64 and values.size > 0
@@ -157,19 +204,42 @@ def _check_all(field: str, values: Any, good: Any, allowed: str) -> None:
 def as_numpy(field: str, values: Any) -> np.ndarray:
     """Return ``values`` as a NumPy array of floats.
 
+    Numbers are real numbers of any precision and truth values (0 and 1): arrays of NumPy, JAX and torch (without their
+    gradient), and nested lists and tuples of numbers. What is masked out of a masked array becomes NaN.
+
     Raises:
-        InvalidValueError: if something in it (``None``, text) is not a number.
+        InvalidValueError: for all else: text, ``None``, complex numbers, decimals, dictionaries, sets, generators.
     """
-    if hasattr(values, "detach"):
-        values = values.detach().cpu().double()  # NumPy has no bfloat16
+    if type(values) is np.ndarray and values.dtype.char == "d":
+        return values
     try:
-        array = np.asarray(values)
-        if array.dtype.kind in "OSUMmc":
-            raise TypeError
-        return array.astype(np.float64, copy=False)
-    except (TypeError, ValueError):
+        try:
+            return _floats(values)
+        except (TypeError, RuntimeError):  # NumPy reads no tensors in a list that have a gradient or are bfloat16
+            return _floats(_detached(values))
+    except (TypeError, ValueError, RuntimeError):
         allowed = "real numbers in rows of equal length (a missing rating is marked with mask=)"
         raise InvalidValueError(field, values, allowed) from None
+
+
+def _detached(values: Any) -> Any:
+    if isinstance(values, list | tuple):
+        return [_detached(part) for part in cast("list[Any]", values)]
+    return _floats(values) if hasattr(values, "detach") else values
+
+
+def _floats(values: Any) -> np.ndarray:
+    if hasattr(values, "detach"):
+        if values.is_complex():
+            raise TypeError
+        values = values.detach().cpu().double()  # NumPy has no bfloat16
+    array = np.asarray(values)
+    if array.dtype.kind in "OSUTMmc" or array.dtype.names is not None:
+        raise TypeError
+    if isinstance(values, np.ma.MaskedArray):
+        return np.ma.filled(values.astype(np.float64), np.nan)
+    with np.errstate(over="ignore"):  # of a long double; the checks that follow find the infinity
+        return array.astype(np.float64, copy=False)
 
 
 def same_shape(field: str, value: Any, other_field: str, other: Any) -> None:

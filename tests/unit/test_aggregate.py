@@ -285,3 +285,49 @@ def test_what_is_no_array_is_refused_by_name(name):
     given = {"ratings": np.zeros((1, 2)), "proxy": np.zeros(1), "mask": np.ones((1, 2), bool)}
     with pytest.raises(InvalidValueError, match=rf"^{name} = .*an array"):
         aggregate(**(given | {name: [[1.0]]}))
+
+
+@pytest.mark.parametrize(
+    ("ratings", "message"),
+    [
+        (np.array([["1", "2"]]), r"^ratings\.dtype = dtype\('<U1'\): must be real numbers in a plain array"),
+        (np.array([[1j, 2.0]]), r"^ratings\.dtype = dtype\('complex128'\)"),
+        (torch.tensor([[1j, 2.0]]), r"^ratings\.dtype = torch\.complex64"),
+        (np.array([[1.0, None]]), r"^ratings\.dtype = dtype\('O'\)"),
+        (np.ma.array([[1.0, 2.0]], mask=[[False, True]]), r"^ratings\.dtype = 'a masked array'"),
+        (
+            np.array([[1e308, -1e308]]),
+            r"^ratings\[0, 0\] = 1e\+308: must be in \[-1e\+100, 1e\+100\], or its",
+        ),
+        (torch.tensor([[1.0, 1e20]]), r"^ratings\[0, 1\] = 1.*e\+20: must be in \[-1e\+15, 1e\+15\]"),
+    ],
+    ids=str,
+)
+def test_ratings_that_are_no_numbers_or_too_large_ones_are_named(ratings, message):
+    xp = torch if isinstance(ratings, torch.Tensor) else np
+    with pytest.raises(InvalidValueError, match=message):
+        aggregate(ratings, xp.zeros(1))
+
+
+@pytest.mark.parametrize("proxy", [math.nan, math.inf, 1e200, "4"])
+def test_a_proxy_that_is_no_number_is_named(proxy):
+    with pytest.raises(InvalidValueError, match=r"^proxy(\.dtype|\[0\]) = "):
+        aggregate(np.zeros((1, 2)), np.array([proxy]))
+
+
+@pytest.mark.parametrize("ddof", [-1, math.nan, 0.5, True, None])
+def test_ddof_is_a_whole_number(ddof):
+    with pytest.raises(InvalidValueError, match=r"^ddof = .*: must be a whole number >= 0"):
+        aggregate(np.zeros((1, 2)), np.zeros(1), ddof=ddof)
+
+
+def test_half_precision_is_counted_in_single():
+    """300 squared is no float16."""
+    for ratings in (np.float16([[-300, 300]]), torch.tensor([[-300.0, 300.0]], dtype=torch.float16)):
+        assert aggregate(ratings, ratings[:, 0]).sd.tolist() == [300.0]
+
+
+def test_ratings_with_a_gradient_keep_it():
+    ratings = torch.tensor([[-1.0, 2.0, 1.0]], requires_grad=True)
+    aggregate(ratings, torch.zeros(1)).mean.sum().backward()
+    assert ratings.grad.tolist() == [pytest.approx([1 / 3] * 3)]

@@ -1,3 +1,5 @@
+from decimal import Decimal
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -74,7 +76,16 @@ def test_nonnegative_names_the_first_place():
         _checks.nonnegative("sigma", -2.0)
 
 
-@pytest.mark.parametrize("values", [[1, None], ["1", "2"], [1, "x"], [[1, 2], [3]], [1j], "abc", np.array(["1"]), None])
+ITSELF: list = [1.0]
+ITSELF.append(ITSELF)
+NO_NUMBERS = [
+    *([1, None], ["1", "2"], [1, "x"], [[1, 2], [3]], [1j], "abc", np.array(["1"]), None, {17: 4.0}, {1.0}, ITSELF),
+    *((x for x in [1.0]), [Decimal(1)], Decimal(1), 10**400, 10**5000, torch.tensor([1j]), np.zeros(1, [("a", float)])),
+    *([torch.ones(2), torch.ones(3)], np.array(["1"], dtype=np.dtypes.StringDType())),
+]
+
+
+@pytest.mark.parametrize("values", NO_NUMBERS, ids=lambda v: type(v).__name__)
 def test_as_numpy_takes_real_numbers_only(values):
     with pytest.raises(InvalidValueError, match=r"^ratings = .*must be real numbers in rows of equal length .*mask="):
         _checks.as_numpy("ratings", values)
@@ -89,6 +100,9 @@ def test_as_numpy_takes_real_numbers_only(values):
         jnp.asarray([1, 2], jnp.bfloat16),
         torch.tensor([1, 2], dtype=torch.bfloat16),
         torch.tensor([1.0, 2.0], requires_grad=True),
+        [torch.tensor(1.0, requires_grad=True), torch.tensor(2.0, dtype=torch.bfloat16)],
+        [jnp.float32(1), np.float16(2)],
+        np.array([1, 2], np.longdouble),
     ],
     ids=lambda v: f"{type(v).__name__}-{getattr(v, 'dtype', '')}",
 )
@@ -96,6 +110,39 @@ def test_as_numpy_takes_every_precision(values):
     array = _checks.as_numpy("x", values)
     assert array.dtype == np.float64
     assert array.tolist() == [1.0, 2.0]
+
+
+def test_what_is_masked_out_of_a_masked_array_is_missing():
+    assert np.isnan(_checks.as_numpy("x", np.ma.array([1, 2], mask=[False, True]))).tolist() == [False, True]
+
+
+def test_what_would_overflow_when_squared_is_named():
+    _checks.moderate("r", np.array([1e100, -1e100]))
+    _checks.moderate("r", np.zeros(0))
+    with pytest.raises(InvalidValueError, match=r"^r\[1\] = -1e\+200: must be in \[-1e\+100, 1e\+100\], or its square"):
+        _checks.moderate("r", np.array([0.0, -1e200]))
+    with pytest.raises(InvalidValueError, match=r"^r\[0\] = .*e\+16: must be in \[-1e\+15, 1e\+15\]"):
+        _checks.moderate("r", torch.tensor([2e16]))
+    with pytest.raises(InvalidValueError, match=r"^r\[0\] = nan: must be finite"):
+        _checks.moderate("r", np.array([np.nan]))
+
+
+def test_what_does_not_fit_the_precision_in_which_it_leaves_is_named():
+    assert _checks.fitting("r", np.array([1.5, 3e38]), np.float32).dtype == np.float32
+    with pytest.raises(InvalidValueError, match=r"^r\[1\] = 1e\+39: must be in \[-3\.40\S+, 3\.40\S+\], for it leaves"):
+        _checks.fitting("r", np.array([1.0, 1e39]), np.float32)
+
+
+@pytest.mark.parametrize("value", ["false", 0, None, 1.0])
+def test_truth_is_true_or_false(value):
+    _checks.truth("standardise", np.True_)
+    with pytest.raises(InvalidValueError, match=r"^standardise = .*: must be true or false$"):
+        _checks.truth("standardise", value)
+
+
+def test_a_name_is_text_and_an_array_is_none():
+    with pytest.raises(UnknownNameError, match=r"^form = array\(\['wiener', 'wiener'\]"):
+        _checks.choose("form", np.array(["wiener", "wiener"]), ["wiener"])
 
 
 @pytest.mark.parametrize(

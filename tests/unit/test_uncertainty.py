@@ -119,7 +119,8 @@ def test_where_all_agree_the_gradient_is_zero_and_not_nan():
 
 def test_half_precision_of_torch():
     ratings = torch.tensor([-1.0, 2.0, 1.0], dtype=torch.bfloat16)
-    assert sigma_human(ratings).dtype == torch.bfloat16
+    assert sigma_human(ratings).dtype == torch.float32
+    assert sigma_human(torch.tensor([-300.0, 300.0], dtype=torch.float16)) == 300.0  # whose square is no float16
     assert float(sigma_human(ratings)) == pytest.approx(1.247, abs=0.01)
 
 

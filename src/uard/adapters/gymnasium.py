@@ -13,7 +13,21 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from uard.adapters.steps import INFO, KeyFn, RatingsFn, SigmaFn, Steps, map_batch, natural_key, rows_of, subset
+from uard import _checks
+from uard.adapters.steps import (
+    INFO,
+    KeyFn,
+    RatingsFn,
+    SigmaFn,
+    Steps,
+    arrays_of,
+    batch_of,
+    natural_key,
+    refuse_filtered,
+    rows_of,
+    subset,
+    with_row,
+)
 from uard.method.abstention import Abstention
 from uard.method.mitigations import Mitigation
 from uard.ratings.stream import RewardStream
@@ -31,8 +45,21 @@ def _steps(
     abstention: Abstention | None,
     single: str,
 ) -> Steps:
+    _refuse_wrapped(env)
     spaces = getattr(env, f"{single}observation_space"), getattr(env, f"{single}action_space")
     return Steps(RewardStream(mitigation, abstention=abstention), ratings, sigma_m, key or natural_key(*spaces))
+
+
+def _refuse_wrapped(env: Any) -> None:
+    """Refuse environments in which rewards are filtered already, as far as that can be seen from outside."""
+    if isinstance(env, ReliabilityWrapper | VectorReliabilityWrapper):
+        allowed = "environments without one: rewards would be filtered twice"
+        raise _checks.InvalidValueError("env", type(env).__name__, allowed)
+    if isinstance(env, gymnasium.Wrapper | gymnasium.vector.VectorWrapper):
+        _refuse_wrapped(cast("Any", env).env)
+    elif isinstance(env, gymnasium.vector.SyncVectorEnv):
+        for one in cast("Any", env).envs:
+            _refuse_wrapped(one)
 
 
 class ReliabilityWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
@@ -81,38 +108,52 @@ class ReliabilityWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.
             key: Tells state-actions apart, so that the ratings of one are remembered when it comes again; found for
                 numbered states and actions if left out.
             abstention: Marks steps in ``info["abstained"]``.
+
+        Raises:
+            InvalidValueError: a wrapper inside filters already, or an argument is not what it must be.
         """
         gymnasium.utils.RecordConstructorArgs.__init__(
             self, mitigation=mitigation, ratings=ratings, sigma_m=sigma_m, key=key, abstention=abstention
         )
         super().__init__(env)
         self.steps = _steps(env, mitigation, ratings, sigma_m, key, abstention, "")
-        self._observation: Any = None
+        self._observation: Any = None  # a batch of one
+        self._started = False
         self._returns = np.zeros(2)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; all ratings are remembered."""
-        self._observation, info = super().reset(seed=seed, options=options)
+        observation, info = super().reset(seed=seed, options=options)
+        self._observation, self._started = self._seen(observation), True
         self._returns[:] = 0.0
-        return self._observation, info
+        return observation, info
+
+    def _seen(self, observation: Any) -> Any:
+        """Return a copy of an observation, which the environment may change, as a batch; None if nobody looks at it."""
+        return batch_of(self.env.observation_space, observation) if self.steps.reads_steps else None
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take one step and return it with the filtered reward.
 
         Raises:
-            InvalidValueError: for a reward or ratings that no training should be fed.
+            InvalidValueError: for a reward or ratings that no training should be fed, or a reward that was filtered.
+            ResetNeeded: before the first ``reset``.
         """
+        if not self._started:
+            raise gymnasium.error.ResetNeeded("call reset() of the ReliabilityWrapper before step()")
+        acted = batch_of(self.env.action_space, action) if self.steps.reads_steps else None
         next_observation, reward, terminated, truncated, info = super().step(action)
-        found = info.get("ratings")
+        refuse_filtered(info, 'info["raw_reward"]')
+        reached = self._seen(next_observation)
         out = self.steps.filter(
-            _batch(self._observation),
-            _batch(action),
-            _batch(next_observation),
-            np.array([reward], float),
-            None if found is None else rows_of({0: found}, 1),
+            self._observation,
+            acted,
+            reached,
+            _checks.as_numpy("reward", [reward]),
+            rows_of({0: info.get("ratings")}, 1),
         )
         filtered = float(out.reward[0])
-        self._observation = next_observation
+        self._observation = reached
         self._returns += float(out.raw[0]), filtered
         info = info | {name: getattr(out, where)[0].item() for name, where in INFO.items()}
         if terminated or truncated:
@@ -155,16 +196,23 @@ class VectorReliabilityWrapper(gymnasium.vector.VectorWrapper, gymnasium.utils.R
         self.steps = _steps(env, mitigation, ratings, sigma_m, key, abstention, "single_")
         self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         self._observation: Any = None
+        self._started = False
         self._returns = np.zeros((2, self.num_envs))
         self._resetting = np.zeros(self.num_envs, bool)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start episodes (those of ``options["reset_mask"]``, if given); all ratings are remembered."""
         mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)), bool).copy()
-        self._observation, info = super().reset(seed=seed, options=options)
+        observation, info = super().reset(seed=seed, options=options)
+        self._observation, self._started = self._seen(observation), True
         self._returns[:, mask] = 0.0
         self._resetting[mask] = False
-        return self._observation, info
+        return observation, info
+
+    def _seen(self, observation: Any) -> Any:
+        """Return a batch of observations, copied; None if nobody looks at it."""
+        space = cast("Any", self.env).single_observation_space
+        return arrays_of(space, observation) if self.steps.reads_steps else None
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Take one step in every environment and return it with filtered rewards.
@@ -172,18 +220,23 @@ class VectorReliabilityWrapper(gymnasium.vector.VectorWrapper, gymnasium.utils.R
         Raises:
             InvalidValueError: for a reward or ratings that no training should be fed; names the environment.
         """
+        if not self._started:
+            raise gymnasium.error.ResetNeeded("call reset() of the ReliabilityWrapper before step()")
         n = self.num_envs
+        acted = arrays_of(cast("Any", self.env).single_action_space, actions) if self.steps.reads_steps else None
         next_observation, rewards, terminated, truncated, info = super().step(actions)
+        refuse_filtered(info, 'info["raw_reward"]')
         info, ended = dict(info), np.asarray(terminated) | np.asarray(truncated)
-        reached = self._reached(next_observation, ended, info)
+        seen = self._seen(next_observation)
+        reached = self._reached(seen, ended, info)
         found = rows_of(_reported(info, ended if self._mode is AutoresetMode.SAME_STEP else np.zeros(n, bool)), n)
         real = np.flatnonzero(~self._resetting)
-        filtered = np.array(rewards, float)
+        filtered = _checks.as_numpy("reward", rewards).copy()
         if len(real):
             out = self.steps.filter(
-                subset(self._observation, real),
-                subset(actions, real),
-                subset(reached, real),
+                _some(self._observation, real),
+                _some(acted, real),
+                _some(reached, real),
                 filtered[real],
                 None if found is None else found[real],
             )
@@ -198,25 +251,25 @@ class VectorReliabilityWrapper(gymnasium.vector.VectorWrapper, gymnasium.utils.R
                 _put(info, name, over, returns[over], n)
             self._returns[:, over] = 0.0
         self._resetting = ended if self._mode is AutoresetMode.NEXT_STEP else np.zeros(n, bool)
-        self._observation = next_observation
+        self._observation = seen
         return next_observation, filtered, terminated, truncated, info
 
-    def _reached(self, next_observation: Any, ended: Bool[np.ndarray, " B"], info: dict[str, Any]) -> Any:
+    def _reached(self, seen: Any, ended: Bool[np.ndarray, " B"], info: dict[str, Any]) -> Any:
         """Return what the steps led to, before any reset."""
         if self._mode is not AutoresetMode.SAME_STEP or not ended.any() or self.steps.ratings is None:
-            return next_observation
-        rows = [
-            info["final_obs"][i] if ended[i] else subset(next_observation, np.array(i)) for i in range(self.num_envs)
-        ]
-        space = cast("Any", self).single_observation_space
-        out = gymnasium.vector.utils.create_empty_array(space, self.num_envs)
-        return gymnasium.vector.utils.concatenate(space, rows, out)
+            return seen
+        space = cast("Any", self.env).single_observation_space
+        for i in np.flatnonzero(ended):
+            seen = with_row(seen, i, batch_of(space, info["final_obs"][i]))
+        return seen
 
 
 def _reported(info: dict[str, Any], ended: Bool[np.ndarray, " B"]) -> dict[int, Any]:
     """Return the ratings of those environments that reported any; those that just ended did so in ``final_info``."""
     found: dict[int, Any] = {}
     for source, mine in ((info, ~ended), (info.get("final_info", {}), ended)):
+        if isinstance(source.get("ratings"), dict):  # what Gymnasium makes of dictionaries
+            raise _checks.InvalidValueError("ratings", source["ratings"], "a row of K numbers for each environment")
         if "ratings" in source:
             there = np.asarray(source.get("_ratings", np.ones(len(ended), bool))) & mine
             found |= {int(i): source["ratings"][i] for i in np.flatnonzero(there)}
@@ -232,6 +285,6 @@ def _put(
     info[name], info[f"_{name}"] = whole, mask
 
 
-def _batch(one: Any) -> Any:
-    """Return a single observation or action as a batch of one."""
-    return map_batch(one, lambda x: np.asarray(x)[None])
+def _some(batch: Any, chosen: np.ndarray) -> Any:
+    """Return some rows of a batch, None of none."""
+    return None if batch is None else subset(batch, chosen)

@@ -17,7 +17,7 @@ return where it is inside ``ReliabilityVecEnv``, as ``make_vec_env`` has it. The
 
 from __future__ import annotations
 
-import pickle
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -25,11 +25,24 @@ import gymnasium
 import numpy as np
 
 from uard import _checks
-from uard.adapters.steps import INFO, KeyFn, RatingsFn, SigmaFn, Steps, natural_key, rows_of
+from uard.adapters.gymnasium import ReliabilityWrapper
+from uard.adapters.steps import (
+    INFO,
+    KeyFn,
+    RatingsFn,
+    SigmaFn,
+    Steps,
+    arrays_of,
+    batch_of,
+    natural_key,
+    refuse_filtered,
+    rows_of,
+    with_row,
+)
 from uard.method.abstention import Abstention
 from uard.method.mitigations import Mitigation
 from uard.ratings.aggregate import aggregate
-from uard.ratings.stream import Filtered, RewardStream
+from uard.ratings.stream import MAX_KEYS, Filtered, RewardStream
 
 try:
     from stable_baselines3.common.buffers import ReplayBuffer
@@ -41,7 +54,7 @@ except ModuleNotFoundError as error:
     ) from error
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Integer
+    from jaxtyping import Float, Integer
 
 EVERY = 16  # the callback logs one step of so many
 
@@ -76,9 +89,9 @@ class ReliabilityVecEnv(VecEnvWrapper):
         """Wrap environments; the arguments are those of ``uard.adapters.gymnasium.ReliabilityWrapper``.
 
         Raises:
-            InvalidValueError: if rewards arrive normalised: ``VecNormalize`` goes outside.
+            InvalidValueError: if rewards arrive normalised (``VecNormalize`` goes outside) or filtered.
         """
-        _refuse_normalised(venv)
+        _refuse_changed(venv)
         cast("Any", super()).__init__(venv)  # its signature holds types of unknown parameters
         spaces: Any = venv
         key = key or natural_key(spaces.observation_space, spaces.action_space)
@@ -86,17 +99,29 @@ class ReliabilityVecEnv(VecEnvWrapper):
         self.latest: Filtered | None = None
         self._observation: Any = None
         self._actions: Any = None
+        self._started = False
         self._returns = np.zeros((2, venv.num_envs))
 
     def reset(self) -> Any:
         """Start all episodes; all ratings are remembered."""
-        self._observation = self.venv.reset()
+        observation = self.venv.reset()
+        self._observation, self._started = self._seen(observation), True
         self._returns[:] = 0.0
-        return self._observation
+        return observation
+
+    def _seen(self, observation: Any) -> Any:
+        """Return a batch of observations, copied; None if nobody looks at it."""
+        return arrays_of(cast("Any", self.venv).observation_space, observation) if self.steps.reads_steps else None
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Send the actions."""
-        self._actions = actions
+        """Send the actions.
+
+        Raises:
+            ResetNeeded: before the first ``reset``.
+        """
+        if not self._started:
+            raise gymnasium.error.ResetNeeded("call reset() of the ReliabilityVecEnv before step()")
+        self._actions = np.array(actions)
         self.venv.step_async(actions)
 
     def step_wait(self) -> Any:
@@ -107,44 +132,59 @@ class ReliabilityVecEnv(VecEnvWrapper):
         """
         venv: Any = self.venv
         next_observation, rewards, dones, infos = venv.step_wait()
-        reached = next_observation if self.steps.ratings is None else _reached(next_observation, dones, infos)
-        found = _ratings_in(infos)
-        out = self.steps.filter(self._observation, self._actions, reached, np.asarray(rewards, float), found)
+        _refuse_filtered(infos)
+        seen = self._seen(next_observation)
+        reached, space = seen, cast("Any", self.venv).observation_space
+        if self.steps.ratings is not None:  # which is asked about what the steps led to, before any reset
+            for i in np.flatnonzero(dones):
+                reached = with_row(reached, i, batch_of(space, infos[i]["terminal_observation"]))
+        observed = _checks.as_numpy("reward", rewards)
+        out = self.steps.filter(self._observation, self._actions, reached, observed, _ratings_in(infos))
+        learned = _checks.fitting("filtered reward", out.reward, np.float32)
         self.latest = out
         self._returns[0] += out.raw
         self._returns[1] += out.reward
         columns = {name: getattr(out, where).tolist() for name, where in INFO.items()}
+        infos = [dict(info) for info in infos]  # an environment may give the same one again
         for i, info in enumerate(infos):
             for name, values in columns.items():
                 info[name] = values[i]
             if dones[i]:
                 info["raw_return"], info["filtered_return"] = self._returns[:, i].tolist()
                 self._returns[:, i] = 0.0
-        self._observation = next_observation
-        return next_observation, out.reward.astype(np.float32), dones, infos
+        self._observation = seen
+        return next_observation, learned, dones, infos
 
     def save(self, path: str | Path) -> None:
-        """Write all that is known of rewards and ratings to a file, for ``load``."""
-        with Path(path).open("wb") as file:
-            pickle.dump(self.steps.stream, file)
+        """Write all that is known of rewards and ratings to a file, for ``load``; see ``RewardStream.save``."""
+        self.steps.stream.save(path)
 
     @classmethod
-    def load(cls, path: str | Path, venv: VecEnv, **sources: Any) -> ReliabilityVecEnv:
-        """Wrap environments with what ``save`` wrote.
+    def load(
+        cls,
+        path: str | Path,
+        venv: VecEnv,
+        mitigation: Mitigation | None = None,
+        *,
+        ratings: RatingsFn | None = None,
+        sigma_m: SigmaFn | None = None,
+        key: KeyFn | None = None,
+    ) -> ReliabilityVecEnv:
+        """Wrap environments with what ``save`` wrote; nothing in the file is executed.
 
         Args:
             path: The file.
             venv: The environments.
-            sources: ``ratings``, ``sigma_m`` and ``key``, as for a new wrapper.
+            mitigation: Needed if the one that was saved is not uard's own.
+            ratings: As for a new wrapper, as are the next two; functions are not saved.
+            sigma_m: See there.
+            key: See there.
 
         Raises:
-            InvalidValueError: the file holds something else.
+            InvalidValueError: the file holds something else, or its mitigation must be given.
         """
-        with Path(path).open("rb") as file:
-            stream = pickle.load(file)
-        if not isinstance(stream, RewardStream):
-            raise _checks.InvalidValueError("path", str(path), "a file that ReliabilityVecEnv.save wrote")
-        env = cls(venv, stream.mitigation, **sources)
+        stream = RewardStream.load(path, mitigation)
+        env = cls(venv, stream.mitigation, ratings=ratings, sigma_m=sigma_m, key=key)
         env.steps.stream = stream
         return env
 
@@ -153,31 +193,26 @@ def _ratings_in(infos: list[dict[str, Any]]) -> Float[np.ndarray, "B K"] | None:
     return rows_of({i: x["ratings"] for i, x in enumerate(infos) if x.get("ratings") is not None}, len(infos))
 
 
-def _refuse_normalised(venv: Any) -> None:
-    while isinstance(venv, VecEnvWrapper):
-        if isinstance(venv, VecNormalize) and venv.norm_reward:
+def _refuse_filtered(infos: list[dict[str, Any]]) -> None:
+    for i, info in enumerate(infos):
+        refuse_filtered(info, f"infos[{i}]['raw_reward']")
+
+
+def _refuse_changed(venv: Any) -> None:
+    """Refuse environments whose rewards are normalised or filtered, as far as that can be seen from outside."""
+    inner = venv
+    while isinstance(inner, VecEnvWrapper):
+        if isinstance(inner, VecNormalize) and inner.norm_reward:
             allowed = "VecNormalize(ReliabilityVecEnv(venv)): ratings are not in normalised units"
+            raise _checks.InvalidValueError("venv", type(inner).__name__, allowed)
+        if isinstance(inner, ReliabilityVecEnv):
+            allowed = "environments without one: rewards would be filtered twice"
+            raise _checks.InvalidValueError("venv", type(inner).__name__, allowed)
+        inner = inner.venv
+    with suppress(NotImplementedError, AttributeError):  # not everybody's VecEnv can say; the first step tells too
+        if any(venv.env_is_wrapped(ReliabilityWrapper)):
+            allowed = "environments without a ReliabilityWrapper: rewards would be filtered twice"
             raise _checks.InvalidValueError("venv", type(venv).__name__, allowed)
-        venv = venv.venv
-
-
-def _reached(next_observation: Any, dones: Bool[np.ndarray, " B"], infos: list[dict[str, Any]]) -> Any:
-    """Return what the steps led to, before any reset; of a dictionary of arrays, every array."""
-    ended = {int(i): infos[i]["terminal_observation"] for i in np.flatnonzero(dones)}
-    if not ended:
-        return next_observation
-    if isinstance(next_observation, dict):
-        parts = cast("dict[str, Any]", next_observation)
-        return {name: _put(x, {i: last[name] for i, last in ended.items()}) for name, x in parts.items()}
-    return _put(next_observation, ended)
-
-
-def _put(batch: np.ndarray, rows: dict[int, Any]) -> np.ndarray:
-    """Return a copy of an array with some rows replaced."""
-    out = np.array(batch)
-    for i, row in rows.items():
-        out[i] = row
-    return out
 
 
 class ReliabilityReplayBuffer(ReplayBuffer):
@@ -208,11 +243,21 @@ class ReliabilityReplayBuffer(ReplayBuffer):
         key: KeyFn | None = None,
         **options: Any,
     ):
-        """Build an empty buffer; see ``ReplayBuffer`` and ``uard.adapters.gymnasium.ReliabilityWrapper``."""
+        """Build an empty buffer; see ``ReplayBuffer`` and ``uard.adapters.gymnasium.ReliabilityWrapper``.
+
+        Raises:
+            InvalidValueError: for observations that are no arrays.
+        """
+        space = arguments[1] if len(arguments) > 1 else options.get("observation_space")
+        if isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple):
+            allowed = "of arrays: put gymnasium's FlattenObservation around the environment, or use ReliabilityVecEnv"
+            raise _checks.InvalidValueError("observation_space", cast("object", space), allowed)
         cast("Any", super()).__init__(*arguments, **options)
         spaces: Any = self
         key = key or natural_key(spaces.observation_space, spaces.action_space)
-        self.steps = Steps(RewardStream(mitigation), ratings, sigma_m, key)
+        # As many keys as steps: what a step in the buffer points to is never forgotten.
+        stream = RewardStream(mitigation, max_keys=max(MAX_KEYS, self.buffer_size * self.n_envs))
+        self.steps = Steps(stream, ratings, sigma_m, key)
         self.latest: Filtered | None = None
         size = self.buffer_size, self.n_envs
         self._raw = np.zeros(size)
@@ -224,10 +269,13 @@ class ReliabilityReplayBuffer(ReplayBuffer):
         """Store one step of every environment, with the ratings in its ``info``.
 
         Raises:
-            InvalidValueError: for a reward or ratings that no training should be fed; names the environment.
+            InvalidValueError: for a reward or ratings that no training should be fed, or a reward that has been
+                filtered already; names the environment.
         """
         place = self.pos
-        rewards = np.asarray(reward, float).reshape(-1)
+        _refuse_filtered(infos)
+        rewards = _checks.as_numpy("reward", reward).reshape(-1)
+        _checks.fitting("reward", rewards, self.rewards.dtype)
         found = _ratings_in(infos)
         obs, action = np.asarray(obs), np.asarray(action)
         states, acts = obs.reshape(self.n_envs, *self.obs_shape), action.reshape(self.n_envs, self.action_dim)
@@ -262,9 +310,10 @@ class ReliabilityReplayBuffer(ReplayBuffer):
         sigma_m = None
         if self.steps.sigma_m is not None:
             states = self._normalize_obs(self.observations[batch_inds].reshape(-1, *self.obs_shape), env)
-            sigma_m = self.steps.sigma_m(states, self.actions[batch_inds].reshape(-1, self.action_dim))
+            sigma_m = self.steps.sigma_of(states, self.actions[batch_inds].reshape(-1, self.action_dim))
         self.latest = stream.filter(raw, known, sigma_m, keyed=keyed)
-        self.rewards[batch_inds] = self.latest.reward.reshape(-1, self.n_envs)
+        learned = _checks.fitting("filtered reward", self.latest.reward, self.rewards.dtype)
+        self.rewards[batch_inds] = learned.reshape(-1, self.n_envs)
         return super()._get_samples(batch_inds, env)
 
 

@@ -38,7 +38,8 @@ INFO = {
 class Steps:
     """Filters batches of steps.
 
-    Observations may be arrays (B, ...) or dictionaries and tuples of such.
+    Observations and actions may be arrays (B, ...) or dictionaries and tuples of such; of a space that has no arrays
+    (``Sequence``, ``Graph``, ``OneOf``) they are arrays (B,) of objects.
 
     Examples:
         >>> steps = Steps(ratings=lambda observations, actions, next_observations, rewards: rewards[:, None])
@@ -58,11 +59,16 @@ class Steps:
     sigma_m: SigmaFn | None = None
     key: KeyFn | None = None
 
+    @property
+    def reads_steps(self) -> bool:
+        """Whether observations and actions are looked at."""
+        return self.ratings is not None or self.sigma_m is not None or self.key is not None
+
     def keys(self, observations: Any, actions: Any, count: int) -> list[Hashable] | None:
         """Return the keys of a batch of ``count`` steps, or None where all steps differ."""
         if self.key is None:
             return None
-        return [self.key(_row(observations, i), actions[i]) for i in range(count)]
+        return [_ask("key", self.key, _row(observations, i), _row(actions, i)) for i in range(count)]
 
     def ratings_of(
         self,
@@ -79,11 +85,22 @@ class Steps:
         """
         if self.ratings is None:
             return info
-        ratings = _checks.as_numpy("ratings(...)", self.ratings(observations, actions, next_observations, rewards))
+        said = _ask("ratings", self.ratings, observations, actions, next_observations, rewards)
+        ratings = _checks.as_numpy("ratings(...)", said)
         if ratings.ndim != 2 or len(ratings) != len(rewards):
             allowed = f"({len(rewards)}, K), one row per step"
             raise _checks.InvalidValueError("ratings(...).shape", ratings.shape, allowed)
         return ratings
+
+    def sigma_of(self, observations: Any, actions: Any) -> Any:
+        """Return the ensemble's disagreement on a batch, None where there is no ensemble.
+
+        Raises:
+            InvalidValueError: the callable gave no numbers.
+        """
+        if self.sigma_m is None:
+            return None
+        return _checks.as_numpy("sigma_m(...)", _ask("sigma_m", self.sigma_m, observations, actions))
 
     def filter(
         self,
@@ -106,7 +123,7 @@ class Steps:
             InvalidValueError: for rewards, ratings or a sigma_m that no training should be fed.
         """
         ratings = self.ratings_of(observations, actions, next_observations, rewards, info)
-        sigma_m = None if self.sigma_m is None else self.sigma_m(observations, actions)
+        sigma_m = self.sigma_of(observations, actions)
         out = self.stream(rewards, ratings, sigma_m, self.keys(observations, actions, len(rewards)))
         update = getattr(self.sigma_m, "update", None)
         if update is not None:
@@ -145,22 +162,102 @@ def rows_of(entries: Mapping[int, Any], count: int) -> Float[np.ndarray, "B K"] 
         None if there are none at all.
 
     Raises:
-        InvalidValueError: naming the environment whose ratings are no row of numbers.
+        InvalidValueError: naming the environment whose ratings are no list, tuple or array of numbers.
     """
-    rows: dict[int, np.ndarray] = {}
-    for i, entry in entries.items():
-        try:
-            row = np.array([np.nan if x is None else x for x in entry], float)
-        except (TypeError, ValueError):
-            raise _checks.InvalidValueError(f"ratings of environment {i}", entry, "a row of K numbers") from None
-        if row.ndim != 1 or not len(row) or np.isinf(row).any():
-            raise _checks.InvalidValueError(f"ratings of environment {i}", entry, "a row of K finite numbers")
-        rows[i] = row
+    rows = {i: _ratings_row(f"ratings of environment {i}", entry) for i, entry in entries.items() if entry is not None}
     if not rows:
         return None
     out = np.full((count, max(map(len, rows.values()))), np.nan)
     for i, row in rows.items():
         out[i, : len(row)] = row
+    return out
+
+
+def with_row(batch: Any, i: Any, row: Any) -> Any:
+    """Return a copy of a batch with one row replaced by a batch of one.
+
+    Examples:
+        >>> with_row(np.array([1, 2]), 1, np.array([9])).tolist()
+        [1, 9]
+    """
+    if isinstance(batch, dict):
+        return {name: with_row(part, i, row[name]) for name, part in cast("dict[str, Any]", batch).items()}
+    if isinstance(batch, tuple):
+        return tuple(with_row(part, i, x) for part, x in zip(cast("Any", batch), row, strict=True))
+    out = batch.copy()
+    out[i] = row[0]
+    return out
+
+
+def _ratings_row(field: str, entry: Any) -> Float[np.ndarray, " K"]:
+    allowed = "a row of K finite numbers (None or NaN is a missing one)"
+    given: Any = entry
+    try:
+        if isinstance(entry, list | tuple) or getattr(getattr(given, "dtype", None), "kind", "") == "O":
+            given = [np.nan if x is None else x for x in given]
+        row = _checks.as_numpy(field, given)
+    except (TypeError, _checks.InvalidValueError):  # an array of objects may have no dimensions
+        raise _checks.InvalidValueError(field, cast("object", entry), allowed) from None
+    if row.ndim != 1 or not len(row) or np.isinf(row).any():
+        raise _checks.InvalidValueError(field, cast("object", entry), allowed)
+    return row
+
+
+def refuse_filtered(info: Mapping[str, Any], field: str) -> None:
+    """Refuse the ``info`` of a step that has been filtered already.
+
+    Raises:
+        InvalidValueError: all that this package puts into ``info`` is there.
+    """
+    if "raw_reward" in info and all(name in info for name in INFO):
+        allowed = "not there yet: something inside filters already, and rewards would be filtered twice"
+        raise _checks.InvalidValueError(field, info["raw_reward"], allowed)
+
+
+def _ask(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call what a user gave; a StopIteration of theirs must not end somebody's loop in silence."""
+    try:
+        return function(*arguments)
+    except StopIteration as error:
+        raise RuntimeError(f"{name}(...) raised StopIteration") from error
+
+
+def batch_of(space: gymnasium.Space[Any], one: Any) -> Any:
+    """Return a single observation or action as a batch of one; arrays are copied.
+
+    Examples:
+        >>> batch_of(gymnasium.spaces.Tuple([gymnasium.spaces.Discrete(2)] * 2), (1, 0))
+        (array([1]), array([0]))
+    """
+    spaces = gymnasium.spaces
+    if isinstance(space, spaces.Dict):
+        return {name: batch_of(part, one[name]) for name, part in cast("Any", space).spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(batch_of(part, x) for part, x in zip(cast("Any", space).spaces, one, strict=True))
+    if isinstance(space, ARRAYS):
+        return np.array(one)[None]
+    return _objects([one])
+
+
+def arrays_of(space: gymnasium.Space[Any], batch: Any) -> Any:
+    """Return a batch as Gymnasium's vector environments have it, copied and with arrays only."""
+    spaces = gymnasium.spaces
+    if isinstance(space, spaces.Dict):
+        return {name: arrays_of(part, batch[name]) for name, part in cast("Any", space).spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(arrays_of(part, x) for part, x in zip(cast("Any", space).spaces, batch, strict=True))
+    return np.array(batch) if isinstance(space, ARRAYS) else _objects(batch)
+
+
+_S = gymnasium.spaces
+ARRAYS = (_S.Box, _S.Discrete, _S.MultiDiscrete, _S.MultiBinary, _S.Text)
+"""Spaces of which a batch is an array."""
+
+
+def _objects(items: Any) -> np.ndarray:
+    out = np.empty(len(items), object)
+    for i, item in enumerate(items):
+        out[i] = item
     return out
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from uard import _checks
-from uard.method.arrays import Array, Numbers, namespace, where
+from uard.method.arrays import Array, Numbers, as_floats, namespace, where
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -42,11 +42,12 @@ def sigma_model(values: Array, axis: int = -1, ddof: int = 1) -> Array:
         An array without that axis, in the unit of the values.
 
     Raises:
-        InvalidValueError: if a value is not finite or there are no more than ``ddof`` members.
+        InvalidValueError: if a value is not finite, its square is not, or there are no more than ``ddof`` members.
     """
+    _checks.whole("ddof", ddof)
     values = _floats("values", values)
     _enough("members", values.shape[axis] if values.ndim else 0, ddof)
-    _checks.finite("values", values)
+    _checks.moderate("values", values)
     return deviation(values, axis, ddof)
 
 
@@ -75,7 +76,7 @@ def sigma_human(
             inside a JAX transformation, which can raise none).
 
     Returns:
-        An array without that axis, in the unit of the ratings.
+        An array without that axis, in the unit of the ratings; of single precision for ratings of half.
 
     Raises:
         InvalidValueError: for NaN, infinity or ``None`` where a rating should be, a mask of another shape, no
@@ -84,6 +85,7 @@ def sigma_human(
     Warns:
         OneAnnotatorWarning: a single annotator never disagrees with itself.
     """
+    _checks.whole("ddof", ddof)
     if mask is not None and not hasattr(mask, "shape"):
         mask = _checks.as_numpy("mask", mask)
     ratings = _floats("ratings", ratings, mask)
@@ -98,7 +100,7 @@ def sigma_human(
             stacklevel=2,
         )
     if mask is None:
-        _checks.finite("ratings", ratings)
+        _checks.moderate("ratings", ratings)
         if raters <= ddof:
             if empty is None:
                 _enough("annotators", raters, ddof)
@@ -107,7 +109,11 @@ def sigma_human(
     xp = namespace(ratings, mask)
     ratings, here = xp.asarray(ratings), xp.asarray(mask)
     _checks.same_shape("mask", here, "ratings", ratings)
-    return _masked_std(ratings, here if xp.isdtype(here.dtype, "bool") else here != 0, axis, ddof, empty)
+    if not xp.isdtype(here.dtype, "bool"):
+        if not _checks.is_traced(here) and bool(xp.any((here != 0) & (here != 1))):
+            raise _checks.InvalidValueError("mask", mask, "truth values, or 0 and 1")
+        here = here != 0
+    return _masked_std(ratings, here, axis, ddof, empty)
 
 
 def _floats(field: str, values: Any, mask: Array | None = None) -> Float[Array, "*rest"]:
@@ -118,8 +124,7 @@ def _floats(field: str, values: Any, mask: Array | None = None) -> Float[Array, 
                 cells = np.asarray(values, dtype=object)
                 values = np.where(mask, cells, 0.0).tolist() if cells.shape == np.shape(mask) else values
         return _checks.as_numpy(field, values)
-    xp = namespace(values)
-    return values if xp.isdtype(values.dtype, "real floating") else xp.astype(values, xp.asarray(0.0).dtype)
+    return as_floats(field, values)
 
 
 def deviation(values: Float[Array, "*any"], axis: int, ddof: int) -> Float[Array, "*rest"]:
@@ -152,7 +157,7 @@ def _masked_std(
 ) -> Float[Array, "*rest"]:
     xp = namespace(ratings)
     values = xp.where(mask, ratings, xp.zeros_like(ratings))
-    _checks.finite("ratings", values)
+    _checks.moderate("ratings", values)
     here = xp.astype(mask, ratings.dtype)
     count = xp.sum(here, axis=axis, keepdims=True)
     few = count <= ddof

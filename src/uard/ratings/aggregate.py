@@ -11,7 +11,7 @@ import numpy as np
 
 from uard import _checks
 from uard.method import uncertainty
-from uard.method.arrays import Array, namespace
+from uard.method.arrays import Array, as_floats, namespace
 from uard.method.feedback import ByRater, Feedback
 
 if TYPE_CHECKING:
@@ -36,14 +36,14 @@ def aggregate(
             rating; inside a JAX transformation, where NaN cannot be looked for, ratings without a mask are complete.
         proxy: The observed reward.
         mask: True where a rating exists; what is masked out may hold anything.
-        ddof: Of the deviation; a visit with no more ratings than that has a deviation of 0.
+        ddof: Of the deviation, >= 0; a visit with no more ratings than that has a deviation of 0.
 
     Returns:
         Arrays (...); where nobody rated all numbers but ``proxy`` are 0.
 
     Raises:
-        InvalidValueError: a rating is infinite, shapes do not fit, there is no column, the mask is not of truth values,
-            or something is no array.
+        InvalidValueError: a rating or the proxy is infinite or so large that its square overflows, the proxy is NaN,
+            shapes do not fit, there is no column, the mask is not of truth values, or something is no array of numbers.
     """
     for name, array in (("ratings", ratings), ("proxy", proxy), ("mask", mask)):
         if array is not None and not hasattr(array, "ndim"):
@@ -51,17 +51,16 @@ def aggregate(
     if ratings.ndim == 0 or ratings.shape[-1] == 0 or tuple(ratings.shape[:-1]) != tuple(proxy.shape):
         allowed = f"({', '.join([*map(str, proxy.shape), 'K'])}): one row per reward and one column per rater"
         raise _checks.InvalidValueError("ratings.shape", tuple(ratings.shape), allowed)
-    if getattr(ratings.dtype, "kind", "") != "f":  # neither NumPy's floats nor JAX's
-        xp = namespace(ratings)
-        if not xp.isdtype(ratings.dtype, "real floating"):
-            ratings = xp.astype(ratings, xp.asarray(0.0).dtype)
+    _checks.whole("ddof", ddof)
+    ratings, proxy = as_floats("ratings", ratings), as_floats("proxy", proxy)
+    _checks.moderate("proxy", proxy)
     if mask is not None:
         _checks.same_shape("mask", mask, "ratings", ratings)
         if not namespace(mask).isdtype(mask.dtype, "bool"):
             raise _checks.InvalidValueError("mask.dtype", mask.dtype, "truth values: True where a rating exists")
-    elif not _checks.is_traced(ratings):
-        finite = namespace(ratings).isfinite(ratings)
-        if not finite.all():
+    elif not (_checks.is_small(ratings) or _checks.is_traced(ratings)):
+        small = abs(ratings) <= _checks.largest(ratings)  # which NaN is not
+        if not small.all():
             mask = ratings == ratings
     return _complete(ratings, proxy, ddof) if mask is None else _masked(ratings, proxy, mask, ddof)
 
@@ -85,7 +84,7 @@ def _masked(
     xp = namespace(ratings)
     here = xp.astype(mask, ratings.dtype)
     held = xp.where(mask, ratings, xp.zeros_like(ratings))
-    _checks.finite("ratings", held)
+    _checks.moderate("ratings", held)
     raters = xp.sum(here, axis=-1)
     rated = raters > 0
     zero = xp.zeros_like(raters)

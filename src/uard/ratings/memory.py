@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from uard import _checks
 from uard.method.feedback import ByRater, Feedback
 from uard.ratings.aggregate import empty_rows, from_rows, merged, to_rows
 
@@ -23,9 +24,10 @@ class _Rows:
         raters: K, for which there are columns.
     """
 
-    def __init__(self) -> None:
-        self.values: Float[np.ndarray, "n width"] = np.asfortranarray(empty_rows((0,), 1))
-        self.filled, self.raters = 0, 1
+    def __init__(self, values: Float[np.ndarray, "n width"] | None = None) -> None:
+        rows = empty_rows((0,), 1) if values is None else _checked(values)
+        self.values: Float[np.ndarray, "n width"] = np.asfortranarray(rows)
+        self.filled, self.raters = len(rows), (rows.shape[1] - 5) // 3
 
     def feedback(self) -> Feedback:
         """Return all of it, (n,) arrays."""
@@ -49,6 +51,23 @@ class _Rows:
         return to_rows(visit if raters == self.raters else _widened(visit, self.raters))
 
 
+def _checked(rows: Float[np.ndarray, "n width"]) -> Float[np.ndarray, "n width"]:
+    """Return rows that come from a file.
+
+    Raises:
+        InvalidValueError: they are not what a stream may hold.
+    """
+    if rows.ndim != 2 or rows.dtype != np.float64 or rows.shape[1] < 8 or rows.shape[1] % 3 != 2:
+        raise _checks.InvalidValueError("rows.shape", rows.shape, "(n, 5 + 3 K), of doubles")
+    _checks.finite("rows", rows)
+    known = from_rows(rows)
+    assert known.by_rater is not None
+    for name, values in (("count", known.count), ("sd", known.sd), *known.by_rater._asdict().items()):
+        if name != "mean":
+            _checks.nonnegative(name, values)
+    return rows
+
+
 def _widened(feedback: Feedback, raters: int) -> Feedback:
     """Return feedback (B,) with columns for more raters, who have rated nothing."""
     each = feedback.by_rater
@@ -68,9 +87,22 @@ class FeedbackTable:
         [2.0]
     """
 
-    def __init__(self) -> None:
-        """Start with no state-action."""
-        self._rows = _Rows()
+    def __init__(self, rows: Float[np.ndarray, "n width"] | None = None) -> None:
+        """Start with no state-action, or with the ``rows`` of another table.
+
+        Raises:
+            InvalidValueError: the rows are not what a table may hold.
+        """
+        self._rows = _Rows(rows)
+
+    def rows(self, size: int) -> Float[np.ndarray, "n width"]:
+        """Return the rows of that many state-actions."""
+        self._rows.grow(size)
+        return self._rows.values[:size]
+
+    def forget(self, slot: int) -> None:
+        """Make a state-action one that nobody has rated."""
+        self._rows.values[slot] = 0.0
 
     def observe(self, slots: Integer[np.ndarray, " B"], visit: Feedback, size: int) -> None:
         """Take in visits, one after the other.
@@ -115,6 +147,27 @@ class RatingSample:
         """Start with none; ``capacity`` is how many are kept."""
         self._capacity, self._random = capacity, np.random.default_rng(seed)
         self._rows, self._seen = _Rows(), 0
+
+    def rows(self) -> Float[np.ndarray, "n width"]:
+        """Return the rows that were kept."""
+        return self._rows.values[: self._rows.filled]
+
+    @property
+    def chance(self) -> dict[str, Any]:
+        """How many steps it was shown, and the state of its random numbers."""
+        return {"seen": self._seen, "random": self._random.bit_generator.state}
+
+    def restore(self, rows: Float[np.ndarray, "n width"], chance: dict[str, Any]) -> None:
+        """Go on where another with these ``rows`` and this ``chance`` was.
+
+        Raises:
+            InvalidValueError: the rows, or how many were shown, are not what a sample may hold.
+            KeyError, TypeError, ValueError: the random numbers' state is none.
+        """
+        _checks.whole("seen", chance["seen"], low=len(rows))
+        _checks.whole("number of rows", len(rows), high=self._capacity)
+        self._rows, self._seen = _Rows(rows), chance["seen"]
+        self._random.bit_generator.state = chance["random"]
 
     def put(self, visit: Feedback) -> None:
         """Show it rated steps, (B,) arrays as ``aggregate`` gives them."""

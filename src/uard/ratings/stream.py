@@ -3,12 +3,26 @@
 A ``RewardStream`` is all that the adapters share. Where state-actions come again (``keys``) it remembers the ratings of
 each; where none comes twice, a step's own ratings are all that is known of it, and a uniform sample of all rated steps
 stands for the others.
+
+What a row depends on: its own reward, sigma_m and ratings, the ratings of its own key, and the panel's statistics. No
+other row, no other width and no order of raters makes a difference to its sigma_h. The statistics, over all
+state-actions in memory (with keys) or over the sample (without), are those of the mitigation's ``fit``: for most the
+location and deviation of sigma_h, the scale of the reward, and the mean of the lowest ratings. They are measured when
+1, 2, 4, ... 256, then every 256 further steps have been rated (``refresh``), and no more often than after an eighth as
+many steps as there are keys. A call first takes in the ratings of all its rows, then measures if that is due, and then
+filters all its rows by the same numbers. So a batch is not the same as its rows one by one while the statistics still
+move; what is known of a key, and sigma_h of a row without one, are.
+
+What is kept: 8 (5 + 3 K) bytes, K being the widest panel so far, for each of at most ``capacity`` steps without keys
+and of at most ``max_keys`` keys; of more keys, those whose steps came longest ago are forgotten.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Hashable, Sequence
+from collections import OrderedDict
+from collections.abc import Hashable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -16,7 +30,8 @@ import numpy as np
 from uard import _checks
 from uard.method.abstention import Abstention
 from uard.method.feedback import Feedback
-from uard.method.mitigations import Evidence, Mitigation, uard
+from uard.method.mitigations import Evidence, Explanation, LearningSignal, Mitigation, uard
+from uard.ratings import state
 from uard.ratings.aggregate import aggregate, nothing
 from uard.ratings.memory import FeedbackTable, RatingSample
 
@@ -24,10 +39,17 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 PATIENCE = 1000  # steps without any rating before we say so
+MAX_RATERS = 1000  # what is kept of a step grows with the widest panel
+MAX_KEYS = 100_000  # of a stream that is told nothing else
+SHARE = 8  # statistics over n keys are measured after n / SHARE rated steps at the earliest: a step costs the same
 
 
 class NeverRatedWarning(UserWarning):
     """Nobody has rated anything, so nothing is known and every reward is believed equally little."""
+
+
+class KeysForgottenWarning(UserWarning):
+    """There are more keys than are kept: the ratings of some state-actions are forgotten."""
 
 
 class Filtered(NamedTuple):
@@ -67,7 +89,7 @@ class Observed(NamedTuple):
 
 
 class RewardStream:
-    """Filters rewards as they come. Changed in place; pickling keeps all that it knows.
+    """Filters rewards as they come. Changed in place; ``save`` and ``load`` keep all that it knows.
 
     Examples:
         >>> stream = RewardStream()
@@ -93,6 +115,7 @@ class RewardStream:
         ddof: int = 0,
         capacity: int = 4096,
         refresh: int = 256,
+        max_keys: int = MAX_KEYS,
         seed: int = 0,
     ):
         """Start without any rating.
@@ -103,13 +126,14 @@ class RewardStream:
             ddof: Of sigma_h.
             capacity: Rated steps kept where steps have no keys, >= 2.
             refresh: Rated steps after which the panel's statistics are measured again, >= 1 (more often at first).
-            seed: Of the sample of steps that are kept.
+            max_keys: Keys of which the ratings are kept, >= 1.
+            seed: Of the sample of steps that are kept, >= 0.
 
         Raises:
             InvalidValueError: for a mitigation that needs more than rewards.
         """
         mitigation = uard() if mitigation is None else mitigation
-        allowed = "a Mitigation (see uard.method.mitigations.named)"
+        allowed = "a Mitigation, not its class or its name (see uard.method.mitigations.named)"
         self.mitigation = _checks.instance("mitigation", mitigation, Mitigation, allowed)
         if self.mitigation.acts_on != "reward":
             raise _checks.InvalidValueError(
@@ -118,15 +142,19 @@ class RewardStream:
         _checks.whole("ddof", ddof, high=1)
         _checks.whole("capacity", capacity, low=2)
         _checks.whole("refresh", refresh, low=1)
+        _checks.whole("max_keys", max_keys, low=1)
+        _checks.whole("seed", seed)
+        if abstention is not None:
+            _checks.instance("abstention", abstention, Abstention, "an Abstention")
         # What will never be rated again is known as well as it will ever be.
         self._of_single_visits = self.mitigation.without_prior()
         self.abstention = abstention
         self.rated = 0
-        self.ddof, self._refresh = ddof, refresh
+        self.ddof, self._capacity, self._refresh, self._max_keys = ddof, capacity, refresh, max_keys
         self._table = FeedbackTable()
         self._sample = RatingSample(capacity, seed)
-        self._slots: dict[Hashable, int] = {}
-        self._steps, self._warned = 0, False
+        self._slots: OrderedDict[Hashable, int] = OrderedDict()  # that came longest ago first
+        self._steps, self._warned, self._forgets = 0, False, False
         self._due = 0
         self._statistics: dict[bool, Any] = {}  # by whether state-actions have keys
 
@@ -149,6 +177,7 @@ class RewardStream:
             InvalidValueError: naming field, place, value and what is allowed.
         """
         checked = _column("reward", reward)
+        sigma_m = self._sigma_m(sigma_m, len(checked))  # before anything is remembered
         visit, slots = self._observe(checked, ratings, keys)
         known = visit if slots is None else self.known(slots)
         return self._filter(checked, known, sigma_m, slots is not None, visit.count > 0)
@@ -159,7 +188,11 @@ class RewardStream:
 
     def _observe(self, reward: Float[np.ndarray, " B"], ratings: Any, keys: Sequence[Hashable] | None) -> Observed:
         ratings = np.full((len(reward), 1), np.nan) if ratings is None else _checks.as_numpy("ratings", ratings)
+        if ratings.ndim and ratings.shape[-1] > MAX_RATERS:
+            allowed = f"({len(reward)}, K) with K <= {MAX_RATERS} raters"
+            raise _checks.InvalidValueError("ratings.shape", ratings.shape, allowed)
         visit = aggregate(ratings, reward, ddof=self.ddof)
+        slots = None if keys is None else self._places(keys, len(reward))
         rated = visit.count.nonzero()[0]
         self._steps += len(reward)
         self.rated += len(rated)
@@ -171,14 +204,49 @@ class RewardStream:
                 NeverRatedWarning,
                 stacklevel=3,
             )
-        if keys is None:
+        if slots is None:
             self._sample.put(visit if len(rated) == len(reward) else visit.map(lambda x: x[rated]))
-            return Observed(visit, None)
-        if len(keys) != len(reward):
-            raise _checks.InvalidValueError("len(keys)", len(keys), f"{len(reward)}, one per reward")
-        slots = np.array([self._slots.setdefault(key, len(self._slots)) for key in keys], np.int64)
-        self._table.observe(slots, visit, len(self._slots))
+        else:
+            self._table.observe(slots, visit, len(self._slots))
         return Observed(visit, slots)
+
+    def _places(self, keys: Sequence[Hashable], count: int) -> Int[np.ndarray, " B"]:
+        """Return where ``count`` state-actions are kept; those that came longest ago make room for new ones."""
+        if isinstance(keys, str | bytes | Mapping) or not hasattr(keys, "__len__"):
+            raise _checks.InvalidValueError("keys", keys, "a list of keys, one per reward")
+        if len(keys) != count:
+            raise _checks.InvalidValueError("len(keys)", len(keys), f"{count}, one per reward")
+        if count > self._max_keys:
+            raise _checks.InvalidValueError("len(keys)", count, f"at most max_keys = {self._max_keys}")
+        known = self._slots
+        places: list[int] = []
+        for i, key in enumerate(keys):
+            try:
+                place = known.get(key)
+            except TypeError:
+                raise _checks.InvalidValueError(f"keys[{i}]", key, "hashable, such as a number or a tuple") from None
+            if place is None:
+                known[key] = place = self._room()
+            else:
+                known.move_to_end(key)
+            places.append(place)
+        return np.array(places, np.int64)
+
+    def _room(self) -> int:
+        """Return a place for one more key."""
+        if len(self._slots) < self._max_keys:
+            return len(self._slots)
+        if not self._forgets:
+            self._forgets = True
+            warnings.warn(
+                f"more than max_keys = {self._max_keys} keys: from now on the ratings of those that came longest ago "
+                "are forgotten. Are they keys that come again? Without keys a step is judged by its own ratings",
+                KeysForgottenWarning,
+                stacklevel=5,
+            )
+        _, place = self._slots.popitem(last=False)
+        self._table.forget(place)
+        return place
 
     def filter(self, reward: Any, known: Feedback, sigma_m: Any = None, *, keyed: bool) -> Filtered:
         """Filter rewards by what is known; nothing is remembered.
@@ -195,30 +263,33 @@ class RewardStream:
         Raises:
             InvalidValueError: naming field, place, value and what is allowed.
         """
-        return self._filter(_column("reward", reward), known, sigma_m, keyed, known.count > 0)
+        reward = _column("reward", reward)
+        _checks.same_shape("known.count", known.count, "reward", reward)
+        return self._filter(reward, known, self._sigma_m(sigma_m, len(reward)), keyed, known.count > 0)
 
     def _filter(
         self,
         reward: Float[np.ndarray, " B"],
         known: Feedback,
-        sigma_m: Any,
+        sigma_m: Float[np.ndarray, " B"],
         keyed: bool,
         rated: Bool[np.ndarray, " B"],
     ) -> Filtered:
         zeros = np.zeros(len(reward))
-        sigma_m = zeros if sigma_m is None else _column("sigma_m", sigma_m, nonnegative=True)
-        if len(sigma_m) != len(reward):
-            raise _checks.InvalidValueError("len(sigma_m)", len(sigma_m), f"{len(reward)}, one per reward")
         mitigation = self.mitigation if keyed else self._of_single_visits
-        why = mitigation.explain(Evidence(reward, sigma_m, known), self._measured(keyed))
-        if not _is_one(why.signal.sample_weight):
-            raise _checks.InvalidValueError(
-                "mitigation", self.mitigation, "one that changes rewards; this one leaves steps out of learning"
-            )
-        out = np.asarray(why.signal.reward, np.float64) + zeros
-        _checks.finite("filtered reward", out)
+        with np.errstate(over="ignore"):  # a weight may be one over infinity; what is learned is checked
+            why = mitigation.explain(Evidence(reward, sigma_m, known), self._measured(keyed))
+            out, weight, sigma_h, lam = _explained(mitigation, why, zeros)
         abstained = zeros > 0 if self.abstention is None else self.abstention.abstains(why.doubt, reward)
-        return Filtered(out, reward, why.weight + zeros, why.sigma_h, sigma_m, why.lam + zeros, abstained, rated)
+        return Filtered(out, reward, weight, sigma_h, sigma_m, lam, abstained, rated)
+
+    def _sigma_m(self, values: Any, count: int) -> Float[np.ndarray, " B"]:
+        if values is None:
+            return np.zeros(count)
+        values = _column("sigma_m", values, nonnegative=True)
+        if len(values) != count:
+            raise _checks.InvalidValueError("len(sigma_m)", len(values), f"{count}, one per reward")
+        return values
 
     def known(self, slots: Int[np.ndarray, " B"]) -> Feedback:
         """Return what is known of state-actions at places that ``observe`` gave, (B,) arrays."""
@@ -228,13 +299,121 @@ class RewardStream:
         """Return the panel's statistics, measured again when enough has been rated since."""
         if self.rated >= self._due:
             self._statistics.clear()
-            self._due = self.rated + max(1, min(self.rated, self._refresh))
+            self._due = self.rated + max(1, min(self.rated, self._refresh), len(self._slots) // SHARE)
         if keyed not in self._statistics:
             every = self._table.every() if keyed else self._sample.feedback()
             if not len(every.count):
                 every = nothing((1,), 1)
             self._statistics[keyed] = self.mitigation.fit(every, every.count > 0)
         return self._statistics[keyed]
+
+    def save(self, path: str | Path) -> None:
+        """Write all that it knows to a file of arrays and JSON, for ``load``; the old file stays whole until then.
+
+        The statistics are not in it: they are measured anew, here and there, so that both go on alike.
+
+        Raises:
+            InvalidValueError: a key is not made of numbers, text, bytes, truth values, None and tuples of such.
+            OSError: the file cannot be written.
+        """
+        rows = {"table": self._table.rows(len(self._slots)), "sample": self._sample.rows()}
+        plain = {name: getattr(self, f"_{name}") for name in (*OPTIONS, *COUNTERS)}
+        plain |= {"ddof": self.ddof, "rated": self.rated, "chance": self._sample.chance}
+        plain["mitigation"] = state.described(self.mitigation)
+        plain["abstention"] = None if self.abstention is None else state.described(self.abstention)["fields"]
+        plain["keys"] = [state.plain_key(key) for key in self._slots]
+        slots = np.fromiter(self._slots.values(), np.int64, len(self._slots))
+        state.write(path, state.State(plain, {**rows, "slots": slots}))
+        self._statistics.clear()
+
+    @classmethod
+    def load(cls, path: str | Path, mitigation: Mitigation | None = None) -> RewardStream:
+        """Return the stream that ``save`` wrote. Nothing in the file is executed or imported.
+
+        Examples:
+            >>> import tempfile
+            >>> stream = RewardStream()
+            >>> _ = stream([4.0], [[-1.0, 2.0, 1.0]])
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     stream.save(folder + "/stream.npz")
+            ...     RewardStream.load(folder + "/stream.npz").rated
+            1
+
+        Args:
+            path: The file.
+            mitigation: Instead of the one in the file; needed for one that is not uard's own.
+
+        Raises:
+            InvalidValueError: the file is no such file, truncated or changed, or its mitigation must be given.
+        """
+        allowed = "a file that save wrote (pickles of version 0.1 are not read)"
+        try:
+            plain, arrays = state.read(path)
+            kept = state.mitigation_of(plain["mitigation"])
+            kind = str(plain["mitigation"]["kind"])
+        except state.BROKEN as error:
+            why = "" if "allow_pickle" in str(error) else f": {error}"  # do not say how to execute it
+            raise _checks.InvalidValueError("path", str(path), f"{allowed}{why}") from None
+        if mitigation is None and kept is None:
+            raise _checks.InvalidValueError("mitigation", None, f"given: the file's, {kind}, is not one of uard's own")
+        mitigation = kept if mitigation is None else mitigation
+        try:
+            rule = None if plain["abstention"] is None else Abstention(**plain["abstention"])
+            options = {name: plain[name] for name in OPTIONS}
+            stream = cls(mitigation, abstention=rule, ddof=plain["ddof"], **options)
+            stream._restore(plain, arrays)
+        except state.BROKEN as error:
+            raise _checks.InvalidValueError("path", str(path), f"{allowed}: {error}") from None
+        return stream
+
+    def _restore(self, plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+        for name in ("rated", "steps", "due"):
+            _checks.whole(name, plain[name])
+        for name in ("warned", "forgets"):
+            _checks.truth(name, plain[name])
+        keys, slots = [state.key_of(key) for key in plain["keys"]], arrays["slots"]
+        self._slots = OrderedDict(zip(keys, slots.tolist(), strict=True))
+        self._table = FeedbackTable(arrays["table"])
+        size = len(arrays["table"])
+        if len(self._slots) != size or size > self._max_keys or sorted(self._slots.values()) != list(range(size)):
+            raise _checks.InvalidValueError("keys", keys, f"{size} different ones, each with a row")
+        self._sample.restore(arrays["sample"], plain["chance"])
+        self.rated = plain["rated"]
+        for name in COUNTERS:
+            setattr(self, f"_{name}", plain[name])
+
+
+OPTIONS = ("capacity", "refresh", "max_keys")
+COUNTERS = ("steps", "due", "warned", "forgets")
+
+
+def _explained(mitigation: Mitigation, why: Any, zeros: Float[np.ndarray, " B"]) -> list[Float[np.ndarray, " B"]]:
+    """Return reward, weight, sigma_h and lambda_t of what a mitigation, which may be anybody's, gave.
+
+    Raises:
+        InvalidValueError: it gave something else than finite numbers, one per step, or leaves steps out of learning.
+    """
+    name = type(mitigation).__name__
+    _checks.instance(f"{name}.explain(...)", why, Explanation, "an Explanation")
+    signal = _checks.instance(f"{name}.signal(...)", why.signal, LearningSignal, "a LearningSignal")
+    if not _is_one(signal.sample_weight):
+        raise _checks.InvalidValueError(
+            "mitigation", mitigation, "one that changes rewards; this one leaves steps out of learning"
+        )
+    out = _checks.as_numpy(f"{name}.signal(...).reward", signal.reward)
+    if out.shape != zeros.shape:
+        raise _checks.InvalidValueError(f"{name}.signal(...).reward.shape", out.shape, f"{zeros.shape}, one per step")
+    _checks.moderate("filtered reward", out)
+    columns = [out]
+    for field in ("weight", "sigma_h", "lam"):
+        values = _checks.as_numpy(f"{name}.explain(...).{field}", getattr(why, field))
+        if values.shape not in (zeros.shape, ()):
+            allowed = f"{zeros.shape}, one per step"
+            raise _checks.InvalidValueError(f"{name}.explain(...).{field}.shape", values.shape, allowed)
+        columns.append(values + zeros)
+    if np.isnan(np.add.reduce(columns[1] + columns[2] + columns[3])):
+        _checks.finite(f"{name}.explain(...)", np.stack(columns[1:]))
+    return columns
 
 
 def _is_one(sample_weight: Any) -> bool:
@@ -245,5 +424,7 @@ def _column(field: str, values: Any, nonnegative: bool = False) -> Float[np.ndar
     values = _checks.as_numpy(field, values)
     if values.ndim != 1:
         raise _checks.InvalidValueError(f"{field}.shape", values.shape, "(B,), one number per step")
-    (_checks.nonnegative if nonnegative else _checks.finite)(field, values)
+    if nonnegative:
+        _checks.nonnegative(field, values)
+    _checks.moderate(field, values)
     return values

@@ -66,6 +66,9 @@ class RewardDiscounting(Mitigation):
         Raises:
             InvalidValueError: naming the field, the value and what is allowed.
         """
+        _checks.instance("filter", self.filter, ReliabilityFilter, "a ReliabilityFilter")
+        _checks.truth("proxy_is_rater", self.proxy_is_rater)
+        _checks.truth("standardise", self.standardise)
         _checks.choose("acts_on", self.acts_on, ("reward", "score", "both"))
         _checks.choose("anchor", self.anchor, ("zero", "lowest"))
         _checks.choose("backup", self.backup, ("greedy", "consistent"))

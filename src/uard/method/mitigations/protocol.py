@@ -6,9 +6,11 @@ shape.
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
+from uard import _checks
 from uard.method.arrays import Array, Numbers, namespace
 from uard.method.feedback import Feedback
 
@@ -17,6 +19,13 @@ if TYPE_CHECKING:
 
 Backup = Literal["greedy", "consistent"]
 ActsOn = Literal["reward", "score", "both"]
+METHODS = {
+    "fit": ("self", "feedback", "rated"),
+    "signal": ("self", "evidence", "statistics"),
+    "explain": ("self", "evidence", "statistics"),
+    "score": ("self", "mu", "sigma_m", "feedback", "statistics"),
+}
+"""What a mitigation's methods are given, in this order."""
 
 
 class Evidence(NamedTuple):
@@ -95,6 +104,27 @@ class Mitigation(ABC):
     acts_on: ActsOn = "reward"
     backup: Backup = "greedy"
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Check what a class says of itself when it is defined.
+
+        Raises:
+            InvalidValueError: ``acts_on`` or ``backup`` is unknown, or a method has other parameters.
+        """
+        super().__init_subclass__(**options)
+        for field, allowed in (("acts_on", get_args(ActsOn)), ("backup", get_args(Backup))):
+            if isinstance(value := getattr(cls, field), str):  # or it is a dataclass's field
+                _checks.choose(f"{cls.__name__}.{field}", value, allowed)
+        for name, allowed in METHODS.items():
+            method = cls.__dict__.get(name)
+            if not inspect.isfunction(method):
+                continue
+            try:
+                inspect.signature(method).bind(*allowed, **({"one_action": True} if name == "score" else {}))
+            except TypeError:
+                given = str(inspect.signature(method))
+                wanted = ", ".join([*allowed, "*, one_action=False"] if name == "score" else allowed)
+                raise _checks.InvalidValueError(f"{cls.__name__}.{name}", given, f"({wanted})") from None
+
     def fit(self, feedback: Feedback, rated: Bool[Array, "*batch"]) -> Any:
         """Return the statistics of the panel over all distinct state-actions, for the methods below.
 
@@ -131,6 +161,7 @@ class Mitigation(ABC):
     def explain(self, evidence: Evidence, statistics: Any) -> Explanation:
         """Return what is learned and why; of a mitigation without weights, everything is believed as it is learned."""
         signal, feedback = self.signal(evidence, statistics), evidence.feedback
+        _checks.instance(f"{type(self).__name__}.signal(...)", signal, LearningSignal, "a LearningSignal")
         xp = namespace(evidence.reward, feedback.sd)
         zero = xp.zeros_like(evidence.reward)
         sigma_h = xp.where(feedback.count > 0, feedback.sd, zero)

@@ -47,10 +47,15 @@ def named(name: str, **parameters: Any) -> Mitigation:
 
     Raises:
         UnknownNameError: with the nearest name.
+        InvalidValueError: it has no such parameter, or a value is not allowed.
         PluginError: a plugin that cannot be used.
     """
+    _checks.instance("mitigation", name, str, "a name")
     if name in NAMED:
-        return NAMED[name](**parameters)
+        try:
+            return NAMED[name](**parameters)
+        except TypeError as error:  # ours raise no other
+            raise _checks.InvalidValueError(f"parameters of {name!r}", parameters, f"its fields ({error})") from None
     return plugins.pick("mitigation", name, NAMED, [*NAMED]).make(fault, **parameters)
 
 
