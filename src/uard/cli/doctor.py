@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from tyro.conf import Positional
 
 from uard import InvalidValueError, __version__
 from uard.cli import terminal
-from uard.cli.settings import Pairs
+from uard.cli.settings import Pairs, Words
 from uard.cli.settings import mitigation as mitigation_named
 from uard.cli.settings import settings as read
 
@@ -29,12 +30,21 @@ class Doctor:
     """
 
     log: Positional[str]
-    """A CSV, JSONL or Parquet file (columns: reward, rating..., and if you have them sigma_m, true_reward, item,
-    episode, step), or the id of a Gymnasium environment, which is rolled out with random actions."""
+    """A CSV, JSON, JSONL or Parquet file (columns: reward, rating..., and if you have them sigma_m, true_reward, item,
+    episode, step; or a row per answer, as annotation tools export them), or the id of a Gymnasium environment, which is
+    rolled out with random actions."""
     reward: str = "reward"
     """The column of rewards."""
     ratings: tuple[str, ...] = ()
     """The annotators' columns; all that start with `rating` if left out."""
+    rater: str | None = None
+    """In a log of one answer per row, the column that says who rated."""
+    item: str | None = None
+    """The column that says what was rated."""
+    rating: str | None = None
+    """In a log of one answer per row, the column of ratings, or the question whose answers are read."""
+    missing: Words = ()
+    """A further word that means that a number is missing, e.g. '?'. Repeatable."""
     mitigation: str = "uard"
     """The filter that is going to be used."""
     set_mitigation: Pairs = ()
@@ -70,8 +80,9 @@ class Doctor:
         """Return the log: of a file if it looks like one, else of an environment."""
         from uard.ratings import readers, rollout
 
-        if Path(self.log).suffix.lower() in readers.FORMATS or Path(self.log).exists():
-            return readers.read(self.log, self.reward, self.ratings or None)
+        if Path(self.log).suffix.lower() in readers.FORMATS or os.path.exists(self.log):
+            columns = {"rater": self.rater, "item": self.item, "rating": self.rating}
+            return readers.read(self.log, self.reward, self.ratings or None, **columns, missing=self.missing)
         import gymnasium
 
         import uard.envs  # noqa: F401  (registers ids)

@@ -56,7 +56,7 @@ class Case:
         distinct: What is known of every distinct item.
         rated: Whether anybody has rated the row's item.
         together: Whether at least two raters have rated one row of the item, so that they can be compared.
-        unit: Standard deviation of the rewards; 1 if all are equal.
+        unit: Standard deviation of the rewards, or of the ratings if the log holds no rewards; 1 if all are equal.
         noise: How far the mean of a row's ratings may be from what raters mean: so many of its median standard errors
             that among all rows hardly one gets there by chance.
         chosen: The filter that is going to be used.
@@ -113,6 +113,8 @@ def case_of(log: RatingLog, name: str, method: Mitigation) -> Case:
     Raises:
         InvalidValueError: no reward is a number.
     """
+    if log.reward is None:
+        return _without_reward(log, name, method)
     rows = np.flatnonzero(usable(log.reward))
     if not rows.size:
         raise _checks.InvalidValueError(f"{log.source}: column of rewards", "no number", "finite numbers")
@@ -145,6 +147,33 @@ def case_of(log: RatingLog, name: str, method: Mitigation) -> Case:
         chosen=outcome(name, method),
         printed=outcome(PRINTED, as_filter(PRINTED)),
         recommended=outcome("uard", as_filter("uard")),
+    )
+
+
+def _without_reward(log: RatingLog, name: str, method: Mitigation) -> Case:
+    """Return the case of a log that holds no rewards: they are NaN, and so is all that filters make of them."""
+    unknown = np.full(len(log), np.nan)
+    ratings = np.where(usable(log.ratings), log.ratings, np.nan)
+    known, distinct = feedback_of(unknown, ratings, None)
+    here = np.isfinite(ratings)
+    outcomes = [FilterOutcome(n, m, unknown, unknown) for n, m in ((name, method), (PRINTED, as_filter(PRINTED)))]
+    deviation = float(ratings[here].std()) if here.any() else 0.0
+    return Case(
+        log=log,
+        rows=np.arange(len(log)),
+        reward=unknown,
+        ratings=ratings,
+        sigma_m=None,
+        true=None,
+        feedback=known,
+        distinct=distinct,
+        rated=known.count > 0,
+        together=here.sum(1) >= 2,
+        unit=deviation or 1.0,
+        noise=0.0,
+        chosen=outcomes[0],
+        printed=outcomes[1],
+        recommended=outcomes[0],
     )
 
 

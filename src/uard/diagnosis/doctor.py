@@ -20,6 +20,7 @@ from uard import _checks
 from uard.diagnosis import filter_checks, log_checks
 from uard.diagnosis.case import Case, as_filter, case_of, feedback_of, filtered_rows, numbered
 from uard.diagnosis.finding import SEVERITIES, Diagnosis, Finding
+from uard.diagnosis.self_consistency import self_consistency
 from uard.method.mitigations import Mitigation
 from uard.ratings import readers
 from uard.ratings.agreement import krippendorff_alpha
@@ -35,6 +36,10 @@ def doctor(
     *,
     reward: str = "reward",
     ratings: Sequence[str] | None = None,
+    rater: str | None = None,
+    item: str | None = None,
+    rating: str | None = None,
+    missing: Sequence[str] = (),
 ) -> Diagnosis:
     """Name every known trap that a log of rewards and ratings is in.
 
@@ -44,23 +49,27 @@ def doctor(
         ['reward-contradicted']
 
     Args:
-        log: A ``uard.ratings.log.RatingLog``; the path of a CSV, JSONL or Parquet file; or named columns. See
-            ``uard.ratings.readers`` for the columns.
+        log: A ``uard.ratings.log.RatingLog``; the path of a CSV, JSON, JSONL or Parquet file; or named columns. See
+            ``uard.ratings.readers`` for the columns. Of a log without rewards only the raters are checked.
         mitigation: The filter that is going to be used: the name of one, or a ``Mitigation``.
         reward: Name of the column of rewards, for a file or columns.
         ratings: Names of the annotators' columns, likewise; all that start with ``rating`` if left out.
+        rater: For a file or columns of one answer per row: the column that says who rated.
+        item: Likewise the column that says what was rated.
+        rating: Likewise the column of ratings, or the question whose answers are read.
+        missing: Further words that mean that a number is missing.
 
     Raises:
         InvalidValueError: the log cannot be read (the message names row and column), no reward in it is a number, or
             the mitigation is no reliability filter.
     """
     if isinstance(log, str | Path):
-        log = readers.read(log, reward, ratings)
+        log = readers.read(log, reward, ratings, rater=rater, item=item, rating=rating, missing=missing)
     elif not isinstance(log, RatingLog):
-        log = readers.from_columns(log, reward, ratings)
+        log = readers.from_columns(log, reward, ratings, rater=rater, item=item, rating=rating, missing=missing)
     name = mitigation if isinstance(mitigation, str) else "your filter"
     case = case_of(log, name, as_filter(mitigation))
-    found = [log_checks.not_finite(log), *(check(case) for check in CHECKS)]
+    found = [log_checks.not_finite(log), *(check(case) for check in (RATER_CHECKS if log.reward is None else CHECKS))]
     return Diagnosis(
         source=log.source,
         mitigation=name if isinstance(mitigation, str) else repr(mitigation),
@@ -89,17 +98,29 @@ def filtered(log: RatingLog, mitigation: str | Mitigation = "uard") -> Float[np.
         InvalidValueError: a reward is NaN or infinite, a rating or sigma_m is infinite (the message names the row), or
             the mitigation is no reliability filter.
     """
+    if log.reward is None:
+        raise _checks.InvalidValueError("reward", None, f"there: {log.source} holds no rewards that could be filtered")
     _checks.finite("reward", log.reward)
     _checks.finite("ratings", np.where(np.isnan(log.ratings), 0.0, log.ratings))
     known, distinct = feedback_of(log.reward, log.ratings, numbered(log.item))
     return filtered_rows(as_filter(mitigation), log.reward, log.sigma_m, known, distinct)[1]
 
 
+RATER_CHECKS: tuple[Callable[[Case], Finding | None], ...] = (
+    log_checks.no_rewards,
+    log_checks.few_ratings,
+    log_checks.missing_ratings,
+    log_checks.idle_raters,
+    log_checks.one_rater,
+    self_consistency,
+)
+"""What can be checked without rewards."""
 CHECKS: tuple[Callable[[Case], Finding | None], ...] = (
     log_checks.few_ratings,
     log_checks.missing_ratings,
     log_checks.idle_raters,
     log_checks.one_rater,
+    self_consistency,
     log_checks.contradicted,
     log_checks.colluding,
     log_checks.dead_ensemble,
@@ -112,5 +133,5 @@ CHECKS: tuple[Callable[[Case], Finding | None], ...] = (
 CODES = (
     "not-finite", "no-ratings", "few-ratings", "missing-ratings", "idle-raters", "one-rater", "reward-contradicted",
     "other-units", "colluding-raters", "dead-ensemble", "blind-sigma", "smaller-penalties", "origin-and-unit",
-    "lie-still-pays", "saturated-weights",
+    "lie-still-pays", "saturated-weights", "no-rewards", "self-consistency",
 )  # fmt: skip

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def not_finite(log: RatingLog) -> Finding | None:
     """Rewards, ratings or sigmas that are NaN, infinite or absurdly large."""
-    columns = {"reward": log.reward}
+    columns = {} if log.reward is None else {"reward": log.reward}
     columns |= {name: log.ratings[:, k] for k, name in enumerate(log.raters)}
     columns |= {name: column for name in NUMBERS if (column := getattr(log, name)) is not None}
     parts: list[str] = []
@@ -40,6 +40,19 @@ def not_finite(log: RatingLog) -> Finding | None:
         "rating makes sigma_h and the anchor infinite. These rows and cells are left out of everything below.",
         "Drop these rows, or mark missing ratings as missing (sigma_human(ratings, mask=...)); find out what wrote them.",
         numbers,
+    )
+
+
+def no_rewards(case: Case) -> Finding | None:
+    """The log holds no rewards."""
+    if case.log.reward is not None:
+        return None
+    return Finding(
+        "no-rewards",
+        "note",
+        "The log has no column of rewards, so only what concerns the raters alone was checked.",
+        "Whether raters contradict the reward, and what a filter would make of it, is not known.",
+        "Name the column of rewards (--reward), or add one: a row of the export then says what was observed for its item.",
     )
 
 
@@ -82,7 +95,7 @@ def missing_ratings(case: Case) -> Finding | None:
     )
     numbers = {"missing": missing, "unrated_rows": float(none)}
     numbers |= {f"missing_{name}": float(x) for name, x in zip(case.log.raters, per_rater, strict=True)}
-    if none:
+    if none and case.log.reward is not None:
         empty = here.sum(1) == 0
         numbers["mean_reward_unrated"] = float(case.reward[empty].mean())
         numbers["mean_reward_rated"] = float(case.reward[~empty].mean())

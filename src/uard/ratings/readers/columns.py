@@ -67,8 +67,10 @@ class Wanted:
 class Choice(ABC):
     """Which columns of a source are read."""
 
-    named: frozenset[str] = frozenset()
-    """Columns that are read wherever an annotation tool has put them."""
+    @property
+    def named(self) -> frozenset[str]:
+        """Columns that are read wherever an annotation tool has put them."""
+        return frozenset()
 
     @abstractmethod
     def candidate(self, name: str) -> bool:
@@ -245,18 +247,14 @@ def cells_of(column: Any, name: str, source: str) -> Any:
     """
     if isinstance(column, str | bytes | Mapping | Set) or not isinstance(column, Iterable):
         raise _checks.InvalidValueError(f"{source}: column {name!r}", column, "a list or an array, a cell per row")
+    cells: Any = cast("Any", column)
     if isinstance(column, np.ma.MaskedArray):
-        return list(cast("Iterable[Any]", column.tolist()))
-    if hasattr(column, "detach"):
-        column = cast("Any", column).detach().cpu()
-    if isinstance(column, np.ndarray):
-        if column.ndim != 1:
-            raise _checks.InvalidValueError(
-                f"{source}: column {name!r}", column.shape, "of one dimension, a cell per row"
-            )
-        if column.dtype.kind in "iuf":
-            return cast("np.ndarray", column)
-    return list(cast("Iterable[Any]", column))
+        return list(cells.tolist())
+    if hasattr(cells, "detach"):
+        cells = cells.detach().cpu()
+    if len(shape := getattr(cells, "shape", (0,))) != 1:
+        raise _checks.InvalidValueError(f"{source}: column {name!r}", shape, "of one dimension, a cell per row")
+    return cells if isinstance(column, np.ndarray) and cells.dtype.kind in "iuf" else list(cells)
 
 
 def no_binary(text: str, path: Path) -> None:

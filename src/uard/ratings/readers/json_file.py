@@ -28,8 +28,7 @@ def read_json(path: Path, choice: Choice, _: Numbers) -> tuple[dict[str, Any], l
     text = path.read_text(encoding="utf-8-sig")
     no_binary(text, path)
     whole = _parsed(text, str(path))
-    if isinstance(whole, dict):
-        whole = [whole]
+    whole = [whole] if isinstance(whole, dict) else whole
     if not isinstance(whole, list):
         raise _checks.InvalidValueError("log", str(path), "a list of JSON objects")
     return _table((_entry(x, row, path) for row, x in enumerate(cast("list[Any]", whole))), path, choice)
@@ -89,10 +88,12 @@ def _table(entries: Iterator[dict[str, Any]], path: Path, choice: Choice) -> tup
     return {n: columns[n] for n in chosen}, names
 
 
-def _columns(rows: Iterable[dict[str, Any]], choice: Choice) -> tuple[dict[str, list[Any]], set[str], dict[str, int]]:
+def _columns(
+    rows: Iterable[dict[str, Any]], choice: Choice
+) -> tuple[dict[str, list[Any]], dict[str, None], dict[str, int]]:
     """Return columns by name, the names of those that are not read, and in which row a column is first missing."""
     columns: dict[str, list[Any]] = {}
-    others: set[str] = set()
+    others: dict[str, None] = {}
     gaps: dict[str, int] = {}
     count = 0
 
@@ -108,7 +109,7 @@ def _columns(rows: Iterable[dict[str, Any]], choice: Choice) -> tuple[dict[str, 
             if name in others:
                 continue
             if name not in columns and not choice.candidate(name):
-                others.add(name)
+                others[name] = None
             elif isinstance(value, list) and choice.may_be_list(name):
                 for part, cell in enumerate(cast("list[Any]", value)):
                     put(f"{name}[{part}]", [cell])

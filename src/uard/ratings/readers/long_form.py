@@ -34,7 +34,8 @@ def long_log(columns: dict[str, Any], layout: Layout, numbers: Numbers) -> Ratin
         InvalidValueError: a cell is no number, an answer has no rater or no item, the rewards of an item differ, or the
             table would have over ``LARGEST`` cells.
     """
-    assert layout.rater is not None and layout.item is not None
+    assert layout.rater is not None
+    assert layout.item is not None
     source = numbers.source
     cells = parted(columns, layout, source) if layout.parted else columns[layout.ratings[0]]
     rating = numbers.rated(numbers.of(cells, layout.ratings[0].partition(":::")[0], text=True))

@@ -14,7 +14,7 @@ SIDES = (
     ("option1", "option2"), ("first", "second"),
 )  # fmt: skip
 CHOICES = (
-    "choice", "preferred", "preference", "winner", "label", "verdict", "judgment", "judgement", "better", "answer", "rating",
+    "choice", "preferred", "preference", "winner", "label", "verdict", "judgment", "judgement", "better", "answer",
 )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -55,12 +55,12 @@ def _parts(name: str, column: Any, pa: Any, choice: Choice) -> dict[str, Any]:
 
 
 def _cells(column: Any) -> list[Any]:
-    return column if isinstance(column, list) else column.to_pylist()
+    return cast("list[Any]", column if isinstance(column, list) else column.to_pylist())
 
 
 def _numbers(column: Any, name: str, pa: Any, path: Path) -> Any:
     if isinstance(column, list):  # a part of a column of lists
-        return column
+        return cast("list[Any]", column)
     kind, of = column.type, pa.types
     if not (of.is_integer(kind) or of.is_floating(kind) or of.is_decimal(kind) or of.is_null(kind)):
         raise _checks.InvalidValueError(f"{path}: column {name!r}", str(kind), "a column of numbers")

@@ -39,8 +39,8 @@ def rows_of(first: Row, path: Path, named: Collection[str]) -> Callable[[Row], I
 def label_studio(task: Row, path: Path, named: Collection[str] = ()) -> Iterator[Row]:
     """Yield the answers of a task of Label Studio's export "JSON" (1.0 and later), which lists tasks.
 
-    Answers are the results of type ``rating``, ``number`` and ``choices`` of all annotations that were not cancelled; the
-    item is the task's id, the rater ``completed_by`` (its e-mail if it has one), the question the result's ``from_name``.
+    Answers are the results of type ``rating``, ``number`` and ``choices`` of all annotations that were not cancelled.
+    The item is the task's id, the rater ``completed_by`` (the e-mail if it is there), the question ``from_name``.
 
     Args:
         task: With ``annotations`` and ``data``.
@@ -53,11 +53,11 @@ def label_studio(task: Row, path: Path, named: Collection[str] = ()) -> Iterator
     task_id = task.get("id")
     data = _mapping(task.get("data"))
     more = {name: data[name] for name in named if name in data}
-    for annotation in map(_mapping, task.get("annotations") or ()):
+    for annotation in map(_mapping, _list(task.get("annotations"))):
         if annotation.get("was_cancelled"):
             continue
         answers: Row = {}
-        for result in map(_mapping, annotation.get("result") or ()):
+        for result in map(_mapping, _list(annotation.get("result"))):
             key = _CHOSEN.get(str(result.get("type")))
             if key is None:
                 continue
@@ -93,16 +93,16 @@ def argilla(record: Row, path: Path, named: Collection[str] = ()) -> Iterator[Ro
     item = next((record[n] for n in ("id", "_server_id", "external_id") if record.get(n) is not None), None)
     data = {**_mapping(record.get("fields")), **_mapping(record.get("metadata")), **record}
     more = {name: data[name] for name in named if name in data}
-    responses = record.get("responses", {name: x for name, x in record.items() if _is_answers(x)})
+    responses: Any = record.get("responses", {name: x for name, x in record.items() if _is_answers(x)})
     if isinstance(responses, dict):
         by_question = cast("dict[str, Any]", responses)
         given = [
-            (q, _mapping(a), _mapping(a).get("value")) for q, answers in by_question.items() for a in answers or ()
+            (q, _mapping(a), _mapping(a).get("value")) for q, answers in by_question.items() for a in _list(answers)
         ]
     else:
         given = [
             (q, _mapping(a), _mapping(value).get("value", value))
-            for a in cast("list[Any]", responses or [])
+            for a in _list(responses)
             for q, value in _mapping(_mapping(a).get("values")).items()
         ]
     for question, answer, value in given:
@@ -120,7 +120,7 @@ def argilla(record: Row, path: Path, named: Collection[str] = ()) -> Iterator[Ro
 
 
 def _is_answers(cell: Any) -> bool:
-    return isinstance(cell, list) and bool(cell) and {"user_id", "value"} <= _mapping(cast("list[Any]", cell)[0]).keys()
+    return bool(_list(cell)) and {"user_id", "value"} <= _mapping(_list(cell)[0]).keys()
 
 
 def potato(entry: Row, path: Path) -> Iterator[Row]:
@@ -137,7 +137,9 @@ def potato(entry: Row, path: Path) -> Iterator[Row]:
     """
     user = entry.get("user_id") or entry.get("user") or path.absolute().parent.name
     if path.name.startswith("annotated_instances") and path.absolute().parent.name == "annotation_output":
-        allowed = "potato's CSV or TSV (output_annotation_format), or the file of one user: this one does not say who answered"
+        allowed = (
+            "potato's CSV or TSV (output_annotation_format), or one user's file: this one does not say who answered"
+        )
         raise _checks.InvalidValueError("log", str(path), allowed)
     items: Mapping[str, Any] = _mapping(entry.get("instance_id_to_label_to_value")) or {
         str(entry.get("instance_id") or entry.get("id")): entry.get("label_annotations")
@@ -153,3 +155,7 @@ def potato(entry: Row, path: Path) -> Iterator[Row]:
 
 def _mapping(x: Any) -> Mapping[str, Any]:
     return cast("Mapping[str, Any]", x) if isinstance(x, Mapping) else {}
+
+
+def _list(x: Any) -> list[Any]:
+    return cast("list[Any]", x) if isinstance(x, list) else []

@@ -32,13 +32,14 @@ def wide_log(columns: dict[str, Any], layout: Layout, numbers: Numbers) -> Ratin
     ratings = np.empty((rows, len(layout.ratings)))
     for k, name in enumerate(layout.ratings):
         ratings[:, k] = numbers.rated(found[name])
-    names = {"item": layout.item} if layout.item else {}
-    names |= {name: name for name in layout.names}
+    columns_of = {"item": layout.item} if layout.item else {}
+    columns_of |= {name: name for name in layout.names}
+    names: dict[str, Any] = {n: np.array([str(x) for x in columns[c]], dtype=object) for n, c in columns_of.items()}
     return RatingLog(
         reward=found[layout.reward],
         ratings=ratings,
         raters=layout.ratings,
         **{name: found[name] for name in layout.others},
-        **{name: np.array([str(x) for x in columns[column]], dtype=object) for name, column in names.items()},
+        **names,
         source=numbers.source,
     )
