@@ -66,8 +66,8 @@ def _between(ratings: Float[np.ndarray, "n K"]) -> float | None:
     step = max(1, -(-ratings.size // CELLS))
     ordered = np.sort(ratings[::step], axis=1)  # what is missing comes last
     count = np.isfinite(ordered).sum(1)
-    place = np.arange(ordered.shape[1])
+    place = np.arange(ratings.shape[1])
     # In order x_0 <= x_1 ... the differences of all pairs add up to sum_i (2 i - m + 1) x_i.
-    total = np.where(np.isfinite(ordered), (2 * place - count[:, None] + 1) * ordered, 0.0).sum()
+    total = (np.nan_to_num(ordered, nan=0.0) * (2 * place - count[:, None] + 1)).sum()
     pairs = (count * (count - 1) // 2).sum()
     return float(total / pairs) if pairs else None

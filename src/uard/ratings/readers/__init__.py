@@ -157,7 +157,7 @@ def from_columns(
         InvalidValueError: see ``read``; a column is no list or array, such as text, or columns are of unequal length.
     """
     wanted = _wanted(source, reward, ratings, rater, item, rating, missing)
-    if not (isinstance(columns, Mapping) or hasattr(columns, "columns")):
+    if not hasattr(columns, "keys") and not hasattr(columns, "columns"):
         raise _checks.InvalidValueError(source, columns, "named columns: a dict of lists or arrays, or a data frame")
     names: list[Any] = list(getattr(columns, "columns", columns))
     for name in names:

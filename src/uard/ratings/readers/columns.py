@@ -93,7 +93,7 @@ class Choice(ABC):
         return ()
 
 
-def names_in(argument: str, value: Sequence[str]) -> tuple[str, ...]:
+def names_in(argument: str, value: Sequence[Any]) -> tuple[str, ...]:
     """Return several names that a user gives.
 
     Raises:
@@ -148,8 +148,8 @@ class Numbers:
             column: Its name.
             text: Whether text that is a number counts as one.
         """
-        if isinstance(cells, np.ndarray) and cells.ndim == 1 and cells.dtype.kind in "iuf":
-            return cells.astype(float, copy=False)
+        if isinstance(cells, np.ndarray):  # of numbers: see cells_of
+            return cast("np.ndarray", cells).astype(float, copy=False)
         if set(map(type, cells)) <= _PLAIN:
             try:
                 return np.array(cells, dtype=float)
@@ -178,9 +178,9 @@ class Numbers:
         more = f" and {len(self.bad) - _SHOWN} other kinds" if len(self.bad) > _SHOWN else ""
         first = min(row for _, row, _ in self.bad.values())
         where = f"{self.source}: cells that are no numbers{more}, the first in row {first + 1}, by column, with counts"
-        example = next(iter(next(iter(found.values()))))
-        allowed = f"numbers, or nothing where one is missing; missing=({example!r}, ...) or --missing {example!r} say "
-        raise _checks.InvalidValueError(where, found, allowed + "that a word means so")
+        word = next((cell for _, _, cell in self.bad.values() if isinstance(cell, str)), None)
+        hint = "" if word is None else f"; missing=({word!r}, ...) or --missing {word!r} say that a word means so"
+        raise _checks.InvalidValueError(where, found, f"numbers, or nothing where one is missing{hint}")
 
     def _from_text(self, cell: str, row: int, column: str) -> float:
         if cell.strip().lower() in self._words:
@@ -232,9 +232,9 @@ def name_of(cell: Any) -> str | None:
     if isinstance(cell, Mapping):  # Label Studio's users
         user = cast("Mapping[str, Any]", cell)
         cell = user.get("email") or user.get("username") or user.get("id")
-    if cell is None or cell != cell:
+    if cell is None or str(cell) in ("nan", "NaT", "<NA>"):
         return None
-    if isinstance(cell, float | np.floating) and float(cell).is_integer():  # what pandas makes of whole numbers
+    if isinstance(cell, float) and cell.is_integer():  # what pandas makes of whole numbers; NumPy's are floats too
         cell = int(cell)
     return str(cell).strip() or None
 
@@ -245,9 +245,9 @@ def cells_of(column: Any, name: str, source: str) -> Any:
     Raises:
         InvalidValueError: it is text, a dict or a set, has no elements, or has more than one dimension.
     """
+    cells: Any = column
     if isinstance(column, str | bytes | Mapping | Set) or not isinstance(column, Iterable):
-        raise _checks.InvalidValueError(f"{source}: column {name!r}", column, "a list or an array, a cell per row")
-    cells: Any = cast("Any", column)
+        raise _checks.InvalidValueError(f"{source}: column {name!r}", cells, "a list or an array, a cell per row")
     if isinstance(column, np.ma.MaskedArray):
         return list(cells.tolist())
     if hasattr(cells, "detach"):

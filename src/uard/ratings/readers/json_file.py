@@ -28,10 +28,10 @@ def read_json(path: Path, choice: Choice, _: Numbers) -> tuple[dict[str, Any], l
     text = path.read_text(encoding="utf-8-sig")
     no_binary(text, path)
     whole = _parsed(text, str(path))
-    whole = [whole] if isinstance(whole, dict) else whole
-    if not isinstance(whole, list):
+    entries: Any = [whole] if isinstance(whole, dict) else whole
+    if not isinstance(entries, list):
         raise _checks.InvalidValueError("log", str(path), "a list of JSON objects")
-    return _table((_entry(x, row, path) for row, x in enumerate(cast("list[Any]", whole))), path, choice)
+    return _table((_entry(x, row, path) for row, x in enumerate(cast("list[Any]", entries))), path, choice)
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:

@@ -32,7 +32,7 @@ def rows_of(first: Row, path: Path, named: Collection[str]) -> Callable[[Row], I
     if isinstance(first.get("label_annotations"), dict) or "instance_id_to_label_to_value" in first:
         return lambda entry: potato(entry, path)
     if "responses" in first or any(_is_answers(x) for x in first.values()):
-        return lambda record: argilla(record, path, named)
+        return lambda record: argilla(record, named)
     return None
 
 
@@ -74,7 +74,7 @@ def label_studio(task: Row, path: Path, named: Collection[str] = ()) -> Iterator
             yield more | {"annotator": annotation.get("completed_by"), "created_at": when} | {"item": task_id} | answers
 
 
-def argilla(record: Row, path: Path, named: Collection[str] = ()) -> Iterator[Row]:
+def argilla(record: Row, named: Collection[str] = ()) -> Iterator[Row]:
     """Yield the answers of one of Argilla's records, as its versions 1.x and 2.x write them.
 
     2.x (``records.to_json``): ``responses`` holds, by question, lists of ``user_id`` and ``value``. 1.x (feedback
@@ -84,11 +84,7 @@ def argilla(record: Row, path: Path, named: Collection[str] = ()) -> Iterator[Ro
 
     Args:
         record: One record.
-        path: Of the file, for messages.
         named: Columns that are taken from its ``metadata`` or ``fields``.
-
-    Raises:
-        InvalidValueError: the record has no id, or a response is none.
     """
     item = next((record[n] for n in ("id", "_server_id", "external_id") if record.get(n) is not None), None)
     data = {**_mapping(record.get("fields")), **_mapping(record.get("metadata")), **record}
@@ -107,10 +103,6 @@ def argilla(record: Row, path: Path, named: Collection[str] = ()) -> Iterator[Ro
         ]
     for question, answer, value in given:
         if answer.get("status") not in _NOT_GIVEN:
-            if not answer:
-                raise _checks.InvalidValueError(
-                    f"{path}: record {item}, responses", responses, "user_id and value of each"
-                )
             when = answer.get("updated_at") or answer.get("inserted_at")
             yield (
                 more
