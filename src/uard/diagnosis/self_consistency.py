@@ -54,7 +54,7 @@ def self_consistency(case: Case) -> Finding | None:
         evidence + ".",
         "Nobody can agree with others better than with themselves: this difference is noise that more raters average out and no "
         "instruction to agree removes. The last answer is the rating; the earlier ones are not used otherwise.",
-        "Ask those who contradict themselves whether the question is clear, or leave them out (--ratings, or their rows)."
+        "Ask those who contradict themselves whether the question is clear, or leave their answers out."
         if worst
         else "Nothing to do.",
         numbers,
@@ -64,10 +64,10 @@ def self_consistency(case: Case) -> Finding | None:
 def _between(ratings: Float[np.ndarray, "n K"]) -> float | None:
     """Return the mean absolute difference of two raters of one row, each row weighing as many pairs as it has."""
     step = max(1, -(-ratings.size // CELLS))
-    ordered = np.sort(ratings[::step], axis=1)  # what is missing comes last
+    ordered: Float[np.ndarray, "n K"] = np.sort(ratings[::step], axis=1)  # what is missing comes last
     count = np.isfinite(ordered).sum(1)
-    place = np.arange(ratings.shape[1])
     # In order x_0 <= x_1 ... the differences of all pairs add up to sum_i (2 i - m + 1) x_i.
-    total = (np.nan_to_num(ordered, nan=0.0) * (2 * place - count[:, None] + 1)).sum()
+    known = np.where(np.isfinite(ordered), ordered, 0.0)
+    total = sum(float(((2 * i + 1 - count) * known[:, i]).sum()) for i in range(ratings.shape[1]))
     pairs = (count * (count - 1) // 2).sum()
     return float(total / pairs) if pairs else None
