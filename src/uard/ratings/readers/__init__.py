@@ -63,6 +63,7 @@ def read(
     item: str | None = None,
     rating: str | None = None,
     missing: Sequence[str] = (),
+    by: str | None = None,
 ) -> RatingLog:
     r"""Read a log from a file.
 
@@ -89,6 +90,7 @@ def read(
         rating: Long form: the column of ratings, or the question whose answers are read.
         missing: Further words that mean that a number is missing, such as ``?``. One that is a number, such as ``0`` or
             ``-1``, means so among the ratings alone.
+        by: Name of a column that divides the rows into parts, if any.
 
     Raises:
         InvalidValueError: the file cannot be read or is empty, a column is missing or it cannot be told which is meant
@@ -96,7 +98,7 @@ def read(
             words with their counts); a Parquet file without pyarrow; answers about pairs, which
             ``uard.ratings.preferences`` reads.
     """
-    wanted = _wanted(str(path), reward, ratings, rater, item, rating, missing)
+    wanted = _wanted(str(path), reward, ratings, rater, item, rating, missing, by)
     numbers = Numbers(wanted.source, wanted.missing)
     columns, names = table(path, LogChoice(wanted), numbers)
     return _log(columns, names, wanted, numbers)
@@ -136,6 +138,7 @@ def from_columns(
     item: str | None = None,
     rating: str | None = None,
     missing: Sequence[str] = (),
+    by: str | None = None,
 ) -> RatingLog:
     """Take a log from named columns: a dict of lists or arrays, or a data frame.
 
@@ -152,11 +155,12 @@ def from_columns(
         item: The column that says what was rated.
         rating: The column of ratings.
         missing: Further words that mean that a number is missing.
+        by: Name of a column that divides the rows into parts, if any.
 
     Raises:
         InvalidValueError: see ``read``; a column is no list or array, such as text, or columns are of unequal length.
     """
-    wanted = _wanted(source, reward, ratings, rater, item, rating, missing)
+    wanted = _wanted(source, reward, ratings, rater, item, rating, missing, by)
     if not hasattr(columns, "keys") and not hasattr(columns, "columns"):
         raise _checks.InvalidValueError(source, columns, "named columns: a dict of lists or arrays, or a data frame")
     names: list[Any] = list(getattr(columns, "columns", columns))
@@ -181,9 +185,10 @@ def _wanted(
     item: str | None,
     rating: str | None,
     missing: Sequence[str],
+    by: str | None,
 ) -> Wanted:
     several = None if ratings is None else names_in("ratings", ratings)
-    return Wanted(source, reward, several, rater, item, rating, names_in("missing", missing))
+    return Wanted(source, reward, several, rater, item, rating, names_in("missing", missing), by)
 
 
 def _log(columns: dict[str, Any], names: Sequence[str], wanted: Wanted, numbers: Numbers) -> RatingLog:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from uard import _checks
-from uard.ratings.log import bad_cell
+from uard.ratings.log import NUMBERS, bad_cell
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -37,6 +37,7 @@ class Wanted:
         item: Name of the column that says what was rated.
         rating: Long form: name of the column of ratings, or of the question whose answers they are.
         missing: Further words that mean that a number is missing; one that is a number means so among ratings alone.
+        by: Name of the column that divides the rows into parts, or None.
     """
 
     source: str
@@ -46,14 +47,15 @@ class Wanted:
     item: str | None = None
     rating: str | None = None
     missing: tuple[str, ...] = ()
+    by: str | None = None
 
     def __post_init__(self) -> None:
-        """Check that names are text, and that no text stands where several are expected.
+        """Check that names are text, that the form is either wide or long, and that no column of numbers divides rows.
 
         Raises:
             InvalidValueError: naming the argument.
         """
-        for name in ("reward", "rater", "item", "rating"):
+        for name in ("reward", "rater", "item", "rating", "by"):
             value = getattr(self, name)
             if not isinstance(value, str) and (value is not None or name == "reward"):
                 raise _checks.InvalidValueError(name, value, "the name of a column")
@@ -62,6 +64,9 @@ class Wanted:
                 "left out where rater or rating names a column: either each rater has a column, or each row a rater"
             )
             raise _checks.InvalidValueError("ratings", self.ratings, allowed)
+        called_so = self.ratings is None and self.by is not None and self.by.startswith("rating")
+        if self.by is not None and (called_so or self.by in (self.reward, self.rating, *NUMBERS, *(self.ratings or ()))):
+            raise _checks.InvalidValueError("by", self.by, "a column that is neither the reward, a sigma nor a rating")
 
 
 class Choice(ABC):

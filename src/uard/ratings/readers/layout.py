@@ -45,6 +45,7 @@ class Layout(NamedTuple):
         time: When, or None.
         others: Further columns of numbers that are there.
         names: Further columns of names that are there.
+        by: What divides the rows into parts, or None.
     """
 
     reward: str | None
@@ -54,6 +55,7 @@ class Layout(NamedTuple):
     time: str | None
     others: tuple[str, ...]
     names: tuple[str, ...]
+    by: str | None = None
 
     @property
     def parted(self) -> bool:
@@ -68,8 +70,8 @@ class Layout(NamedTuple):
     @property
     def texts(self) -> tuple[str, ...]:
         """The columns that hold names or times."""
-        said = (self.rater, self.item, self.time, *self.names)
-        return (*(n for n in said if n is not None), *(self.ratings if self.parted else ()))
+        said = (self.rater, self.item, self.time, *self.names, self.by, *(self.ratings if self.parted else ()))
+        return tuple(n for n in dict.fromkeys(said) if n is not None)
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ class LogChoice(Choice):
     @property
     def named(self) -> frozenset[str]:
         """See ``Choice``."""
-        said = (self.wanted.reward, self.wanted.item, *NUMBERS, *(n for n in LABELS if n != "item"))
+        said = (self.wanted.reward, self.wanted.item, self.wanted.by, *NUMBERS, *(n for n in LABELS if n != "item"))
         return frozenset(n for n in said if n is not None)
 
     def candidate(self, name: str) -> bool:
@@ -129,7 +131,7 @@ def layout_of(names: Sequence[str], wanted: Wanted) -> Layout:
     if wanted.ratings is None and wanted.rater is None and wanted.rating is None:
         _no_preferences(names, wanted)
     long = wanted.rater is not None or wanted.rating is not None or (raters and not listed)
-    found = _long(names, raters, wanted) if long else _wide(names, wanted)
+    found = (_long(names, raters, wanted) if long else _wide(names, wanted))._replace(by=wanted.by)
     needed = {n for n in (*found.numbers, *found.texts)}
     for name, count in Counter(names).items():
         if count > 1 and name in needed:
@@ -149,8 +151,8 @@ def _no_preferences(names: Sequence[str], wanted: Wanted) -> None:
 def _wide(names: Sequence[str], wanted: Wanted) -> Layout:
     others = [n for n in names if n != wanted.reward]
     whole = {n.partition("[")[0] for n in names} | set(names)
-    for needed in (wanted.reward, *(wanted.ratings or ()), *((wanted.item,) if wanted.item else ())):
-        if needed not in whole:
+    for needed in (wanted.reward, *(wanted.ratings or ()), wanted.item, wanted.by):
+        if needed is not None and needed not in whole:
             raise _checks.UnknownNameError(f"{wanted.source}: column", needed, set(names))
     if wanted.ratings is None:
         ratings = [n for n in others if n.startswith("rating")]
@@ -165,7 +167,7 @@ def _wide(names: Sequence[str], wanted: Wanted) -> Layout:
 
 def _long(names: Sequence[str], raters: Sequence[str], wanted: Wanted) -> Layout:
     whole = set(names)
-    for needed in (wanted.rater, wanted.item, None if wanted.reward == "reward" else wanted.reward):
+    for needed in (wanted.rater, wanted.item, wanted.by, None if wanted.reward == "reward" else wanted.reward):
         if needed is not None and needed not in whole:
             raise _checks.UnknownNameError(f"{wanted.source}: column", needed, whole)
     reward = wanted.reward if wanted.reward in whole else None

@@ -63,6 +63,7 @@ def long_log(columns: dict[str, Any], layout: Layout, numbers: Numbers) -> Ratin
         **{name: of_item[name] for name in layout.others},
         item=np.array(items, dtype=object),
         **{name: np.array([str(columns[name][i]) for i in first], dtype=object) for name in layout.names},
+        by=None if layout.by is None else _part_of_items(columns[layout.by], item, items, layout.by, source),
         source=source,
         repeats=repeats,
     )
@@ -149,6 +150,18 @@ def _per_item(
         allowed += "column, ratings (--ratings) names these columns"
         raise _checks.InvalidValueError(where, (float(column[row]), float(found[item[row]])), allowed)
     return found
+
+
+def _part_of_items(
+    cells: Sequence[Any], item: Integer[np.ndarray, " n"], items: Sequence[str], name: str, source: str
+) -> np.ndarray:
+    """Return the part of the log that each item belongs to."""
+    found: dict[int, str] = {}
+    for i, cell in zip(item.tolist(), cells, strict=True):
+        if found.setdefault(i, str(cell)) != str(cell):
+            where = f"{source}: item {items[i]!r}, column {name!r}"
+            raise _checks.InvalidValueError(where, (found[i], str(cell)), "the same in all rows of an item")
+    return np.array([found[i] for i in range(len(items))], dtype=object)
 
 
 def parted(columns: dict[str, Any], layout: Layout, source: str) -> list[Any]:

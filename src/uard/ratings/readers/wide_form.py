@@ -33,7 +33,7 @@ def wide_log(columns: dict[str, Any], layout: Layout, numbers: Numbers) -> Ratin
     for k, name in enumerate(layout.ratings):
         ratings[:, k] = numbers.rated(found[name])
     columns_of = {"item": layout.item} if layout.item else {}
-    columns_of |= {name: name for name in layout.names}
+    columns_of |= {name: name for name in layout.names} | ({"by": layout.by} if layout.by else {})
     names: dict[str, Any] = {n: np.array([str(x) for x in columns[c]], dtype=object) for n, c in columns_of.items()}
     return RatingLog(
         reward=found[layout.reward],
