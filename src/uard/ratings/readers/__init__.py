@@ -37,7 +37,9 @@ FORMATS: dict[str, Callable[[Path, Wanted], dict[str, Any]]] = {
 }
 
 
-def read(path: str | Path, reward: str = "reward", ratings: Sequence[str] | None = None) -> RatingLog:
+def read(
+    path: str | Path, reward: str = "reward", ratings: Sequence[str] | None = None, *, by: str | None = None
+) -> RatingLog:
     r"""Read a log from a file.
 
     Examples:
@@ -54,6 +56,7 @@ def read(path: str | Path, reward: str = "reward", ratings: Sequence[str] | None
             separated by commas, semicolons or tabs and has a header.
         reward: Name of the column of rewards.
         ratings: Names of the annotators' columns; all that start with ``rating`` if left out.
+        by: Name of a column that divides the rows into parts, if any.
 
     Raises:
         InvalidValueError: the file cannot be read or is empty, a column is missing (the message lists those that are
@@ -63,7 +66,7 @@ def read(path: str | Path, reward: str = "reward", ratings: Sequence[str] | None
     reader = FORMATS.get(path.suffix.lower())
     if reader is None:
         raise _checks.InvalidValueError("log", str(path), f"a file that ends in {', '.join(FORMATS)}")
-    wanted = Wanted(str(path), reward, None if ratings is None else tuple(ratings))
+    wanted = Wanted(str(path), reward, None if ratings is None else tuple(ratings), by)
     try:
         columns = reader(path, wanted)
     except OSError as error:
@@ -77,7 +80,12 @@ def read(path: str | Path, reward: str = "reward", ratings: Sequence[str] | None
 
 
 def from_columns(
-    columns: Mapping[str, Any], reward: str = "reward", ratings: Sequence[str] | None = None, source: str = "log"
+    columns: Mapping[str, Any],
+    reward: str = "reward",
+    ratings: Sequence[str] | None = None,
+    source: str = "log",
+    *,
+    by: str | None = None,
 ) -> RatingLog:
     """Take a log from named columns: a dict of lists or arrays, or a pandas data frame.
 
@@ -90,11 +98,12 @@ def from_columns(
         reward: Name of the column of rewards.
         ratings: Names of the annotators' columns; all that start with ``rating`` if left out.
         source: What to call the log in messages.
+        by: Name of a column that divides the rows into parts, if any.
 
     Raises:
         InvalidValueError: see ``read``.
     """
-    wanted = Wanted(source, reward, None if ratings is None else tuple(ratings))
+    wanted = Wanted(source, reward, None if ratings is None else tuple(ratings), by)
     names = list(columns)
     wanted.check(names)
     return assembled({n: list(columns[n]) for n in names if wanted.has(n)}, wanted)

@@ -26,19 +26,26 @@ class Wanted:
         source: What the source is called in messages.
         reward: Name of the column of rewards.
         ratings: Names of the annotators' columns; all that start with ``rating`` if None.
+        by: Name of the column that divides the rows into parts, or None.
     """
 
     source: str
     reward: str
     ratings: tuple[str, ...] | None
+    by: str | None = None
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Return the names of the columns that are read as text."""
+        return LABELS if self.by is None else (*LABELS, self.by)
 
     def has(self, name: str) -> bool:
         """Whether a column is read."""
-        return name == self.reward or name in NUMBERS or name in LABELS or bool(self.among([name]))
+        return name == self.reward or name in NUMBERS or name in self.labels or bool(self.among([name]))
 
     def among(self, names: Iterable[str]) -> list[str]:
         """Return the annotators' columns among ``names``; ``x[0]`` is a part of ``x``."""
-        others = [n for n in names if n != self.reward]
+        others = [n for n in names if n not in (self.reward, self.by)]
         if self.ratings is None:
             return [n for n in others if n.startswith("rating")]
         return [n for r in self.ratings for n in others if n == r or n.startswith(f"{r}[")]
@@ -50,7 +57,7 @@ class Wanted:
             InvalidValueError: with the names of the columns that are there.
         """
         whole = {name.partition("[")[0] for name in names} | set(names)
-        for needed in (self.reward, *(self.ratings or ())):
+        for needed in (self.reward, *(self.ratings or ()), *(() if self.by is None else (self.by,))):
             if needed not in whole:
                 raise _checks.UnknownNameError(f"{self.source}: column", needed, names)
         if not self.among(names):
@@ -67,7 +74,7 @@ def assembled(columns: Mapping[str, Any], wanted: Wanted) -> RatingLog:
     Raises:
         InvalidValueError: a cell is no number (the message names row and column), columns of unequal length, or no row.
     """
-    numbers = {n: numbers_of(c, n, wanted.source) for n, c in columns.items() if n not in LABELS}
+    numbers = {n: numbers_of(c, n, wanted.source) for n, c in columns.items() if n not in wanted.labels}
     lengths = {n: len(c) for n, c in columns.items()}
     for name, length in lengths.items():
         if length != lengths[wanted.reward]:
@@ -82,6 +89,7 @@ def assembled(columns: Mapping[str, Any], wanted: Wanted) -> RatingLog:
         raters=tuple(order),
         **{n: numbers[n] for n in NUMBERS if n in numbers},
         **{n: np.asarray([str(x) for x in columns[n]]) for n in LABELS if n in columns},
+        by=None if wanted.by is None else np.asarray([str(x) for x in columns[wanted.by]]),
         source=wanted.source,
     )
 

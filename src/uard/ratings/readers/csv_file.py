@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from uard import _checks
-from uard.ratings.log import LABELS, bad_cell
+from uard.ratings.log import bad_cell
 from uard.ratings.readers.columns import A_NUMBER, Wanted, no_binary
 
 _MISSING = frozenset(("", "nan", "na", "n/a", "null", "none"))
@@ -43,10 +43,10 @@ def read_csv(path: Path, wanted: Wanted) -> dict[str, Any]:
                 raise _checks.InvalidValueError(f"{path}: row {start + i + 1}", separator.join(rows[i]), allowed)
             for place, name in places:
                 cells = [row[place] for row in rows]
-                parts[name].append(cells if name in LABELS else _parsed(cells, start, name, str(path)))
+                parts[name].append(cells if name in wanted.labels else _parsed(cells, start, name, str(path)))
             start += len(rows)
     return {
-        n: [x for p in part for x in p] if n in LABELS else np.concatenate([np.zeros(0), *part])
+        n: [x for p in part for x in p] if n in wanted.labels else np.concatenate([np.zeros(0), *part])
         for n, part in parts.items()
     }
 

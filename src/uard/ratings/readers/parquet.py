@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from uard import _checks
-from uard.ratings.log import LABELS
 from uard.ratings.readers.columns import Wanted
 
 
@@ -34,15 +33,15 @@ def read_parquet(path: Path, wanted: Wanted) -> dict[str, Any]:
         raise _checks.InvalidValueError("log", str(path), f"a Parquet file ({error})") from None
     columns: dict[str, Any] = {}
     for name in table.column_names:
-        columns |= _parts(name, table.column(name), pa, path)
+        columns |= _parts(name, table.column(name), pa, path, wanted)
     wanted.check([*columns, *(n for n in names if not wanted.has(n))])
     return columns
 
 
-def _parts(name: str, column: Any, pa: Any, path: Path) -> dict[str, Any]:
+def _parts(name: str, column: Any, pa: Any, path: Path, wanted: Wanted) -> dict[str, Any]:
     """Return one column of the file as one or several by name."""
     kind, of = column.type, pa.types
-    if name in LABELS:
+    if name in wanted.labels:
         return {name: column.to_pylist()}
     if of.is_list(kind) or of.is_fixed_size_list(kind) or of.is_large_list(kind):
         rows: list[list[Any]] = [x or [] for x in column.to_pylist()]
