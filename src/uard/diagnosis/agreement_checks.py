@@ -100,7 +100,7 @@ def _other_units(case: Case, far: Bool[np.ndarray, " n"]) -> Finding:
 
 
 APART = 3.0  # times the scale of another rater: another unit
-SHIFTED = 1.5  # standard deviations of both between their means: another unit
+SHIFTED = 1.75  # standard deviations of both between their means: another unit
 TELLING = 3.0  # standard errors of a correlation that two raters rate the same thing
 
 
@@ -108,7 +108,7 @@ def units(case: Case) -> Integer[np.ndarray, " m"] | None:
     """Return the number of each rater's unit, 0..U-1, -1 where it is not known; None if there is but one.
 
     Two raters who rate the same thing (their correlation on the rows that both rated is over three standard errors
-    above 0) are in different units if their scales differ by a factor of over 3, or their means by over 1.5 standard
+    above 0) are in different units if their scales differ by a factor of over 3, or their means by over 1.75 standard
     deviations. How much noise each has is not known; but the slope of a regression of the wider on the narrower is
     no larger than the ratio of their scales, whatever the noise (Frisch 1934), so noise alone makes no unit.
     """
@@ -191,9 +191,11 @@ def uneven_agreement(strata: tuple[Stratum, ...], overall: float | None) -> Find
         "uneven-agreement",
         "warning",
         f"Over all rows alpha is {overall:.2f}, but "
-        + listed(f"{s.agreement:.2f} in {s.name} ({row_count(s.rows)}, at most {s.high:.2f})" for s in low)
-        + ". Within these rows raters differ by a standard deviation of "
-        + listed(f"{s.within:.3g}, their mean ratings by {s.between:.3g}" for s in low)
+        + listed(
+            f"{s.agreement:.2f} in {s.name} ({row_count(s.rows)}; at most {s.high:.2f}; raters differ by {s.within:.3g} about "
+            f"a row, their means by {s.between:.3g} between rows)"
+            for s in low
+        )
         + ".",
         "Raters agree about which part a row belongs to, not about what is better within it: there the ratings order "
         "rows hardly better than chance, though the number over all looks reliable.",

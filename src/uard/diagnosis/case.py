@@ -118,9 +118,14 @@ class Case:
         return Sample(rows, raters, self.reward[rows], ratings, others)
 
     @cached_property
+    def pairs_with_reward(self) -> Shared:
+        """What the raters of the sample, and the reward as one more, have in common."""
+        return shared(np.column_stack([self.sample.ratings, self.sample.reward]))
+
+    @property
     def pairs_of_raters(self) -> Shared:
         """What the raters of the sample have in common."""
-        return shared(self.sample.ratings)
+        return Shared._make(x[:-1, :-1] for x in self.pairs_with_reward)
 
     def gap(self) -> Float[np.ndarray, " n"]:
         """Return the reward minus the mean rating; 0 where nobody rated."""

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 COMPARISONS = 500_000_000  # of two numbers each, when all pairs of raters are compared for equality
 LONG = 10  # rows of a run of one value
+FLAT = 4.0  # times the standard deviation, what the others agree on has: too constant
 RARE = 1e-4  # how many such runs there would be by chance, in any rater's answers
 
 
@@ -140,7 +141,9 @@ def _sentinels(case: Case, k: int) -> list[_Sentinel]:
 
     Of the rater's most frequent values, each in turn: a line of the others' mean rating on the rater's, fitted to the
     rows with other values, says what the others would say if the value were meant. It is not meant if they are nearer to
-    what they say on average (by six tenths of the way at least), by more than noise, and hardly ever give it themselves.
+    what they say on average (by six tenths of the way at least), by more than noise, and hardly ever give it themselves;
+    and if they find its rows better than those of the next higher values, or worse than those of the next lower ones:
+    without that, a bend of the line would do.
     """
     x, m = case.sample.ratings[:, k], case.sample.others[:, k]
     both = np.isfinite(x) & np.isfinite(m)
@@ -164,10 +167,36 @@ def _sentinels(case: Case, k: int) -> list[_Sentinel]:
         missed = (there - line) * np.sign(usual - line)
         if missed < 0.6 * abs(usual - line) or missed < max(5.0 * error, noise):
             continue
+        if not _out_of_order(value, there, c, a, b, noise):
+            continue
         beside = np.delete(case.sample.ratings[rows[at]], k, 1)
         if (beside == value).sum() <= 0.25 * np.isfinite(beside).sum():
             found.append(_Sentinel(int(case.sample.raters[k]), float(value), there, float(line)))
     return found
+
+
+def _out_of_order(
+    value: float, there: float, count: int, x: Float[np.ndarray, " n"], others: Float[np.ndarray, " n"], noise: float
+) -> bool:
+    """Return whether others find the rows of a value better than its next higher rows, or worse than its next lower ones.
+
+    Args:
+        value: The value.
+        there: What others say of its rows on average.
+        count: How many these are.
+        x: This rater's other ratings.
+        others: What others say of them.
+        noise: Standard deviation of ``others`` about their line.
+    """
+    for sign in (1.0, -1.0):
+        beyond = sign * (x - value)
+        near = np.sort(beyond[beyond > 0])[: max(5, x.size // 10)]
+        if near.size:
+            rows = (beyond > 0) & (beyond <= near[-1])
+            error = noise * np.sqrt(1.0 / count + 1.0 / rows.sum())
+            if sign * (there - others[rows].mean()) > 3.0 * error:
+                return True
+    return False
 
 
 def straight_lines(case: Case) -> Finding | None:
@@ -199,7 +228,8 @@ def _improbable_run(case: Case, k: int, rows: Integer[np.ndarray, " n"]) -> tupl
     """Return start and length of the longest run of one value that neither chance nor the rows explain; length 0 if none.
 
     Chance: in random order, fewer than ``RARE`` runs as long would be expected of a value as frequent. The rows: within the
-    run the reward, and the mean of the other raters, have at least half of their variance over all rows.
+    run the reward, and the mean of the other raters, have at least half of their variance over all rows, and nearly
+    as large a median distance from the median.
     """
     x = case.ratings[rows, k]
     ends = np.flatnonzero(np.diff(x, append=np.nan) != 0)
@@ -226,7 +256,14 @@ def _varies(part: Float[np.ndarray, " m"], whole: Float[np.ndarray, " n"]) -> bo
     part, whole = part[np.isfinite(part)], whole[np.isfinite(whole)]
     if not whole.size or np.ptp(whole) == 0:
         return True
-    return part.size >= LONG and bool(part.var() >= 0.5 * whole.var())
+    if part.size < LONG or part.var() < 0.5 * whole.var():
+        return False
+    return _typical(part) >= np.sqrt(0.5) * _typical(whole)  # a few rewards that lie have most of the variance
+
+
+def _typical(x: Float[np.ndarray, " n"]) -> float:
+    """Return the median distance from the median."""
+    return float(np.median(np.abs(x - np.median(x))))
 
 
 def too_constant(case: Case) -> Finding | None:
@@ -235,8 +272,7 @@ def too_constant(case: Case) -> Finding | None:
     if sample.raters.size < 2:
         return None
     # What all raters see is in the covariance of any two, and no rater of the same scale can vary by less.
-    columns = np.column_stack([sample.ratings, sample.reward])
-    with_reward = shared(columns)
+    with_reward = case.pairs_with_reward
     covariance = with_reward.correlation * with_reward.sd * with_reward.sd.T
     told = (with_reward.rows >= FEW) & (with_reward.correlation * np.sqrt(with_reward.rows) > TELLING)
     np.fill_diagonal(told, False)
@@ -246,7 +282,7 @@ def too_constant(case: Case) -> Finding | None:
     own = np.array([np.nanvar(x) if np.isfinite(x).sum() >= FEW else np.inf for x in sample.ratings.T])
     unit = units(case)
     alone = np.full(own.size, True) if unit is None else unit < 0
-    flat = np.flatnonzero((own > 0) & (10.0 * own < signal) & alone & (both.rows.diagonal() >= FEW))
+    flat = np.flatnonzero((own > 0) & (own * FLAT**2 < signal) & alone & (both.rows.diagonal() >= FEW))
     if not flat.size:
         return None
     names = [case.log.raters[sample.raters[k]] for k in flat]
@@ -282,7 +318,7 @@ def copied_ratings(case: Case) -> Finding | None:
     ratings = np.where(rows[:, None], sample.ratings, np.nan)
     known = sample.reward[:, None] if case.true is None else np.column_stack([sample.reward, case.true[sample.rows]])
     both = shared(residuals(ratings, known))
-    follows = shared(np.column_stack([ratings, sample.reward])).correlation[:-1, -1]
+    follows = case.pairs_with_reward.correlation[:-1, -1]
     spread = both.sd * both.sd.T
     covariance = np.where(both.rows >= FEW, both.correlation * spread, -np.inf)
     np.fill_diagonal(covariance, -np.inf)

@@ -24,14 +24,16 @@ def strata_of(case: Case) -> tuple[Stratum, ...]:
     if names.size > MOST:
         raise _checks.InvalidValueError("by", f"a column of {names.size} different values", f"one of at most {MOST}")
     item = None if case.log.item is None else case.log.item[case.rows]
+    several = np.isfinite(case.ratings).sum(1) > 1
     strata: list[Stratum] = []
     for number, name in enumerate(names):
-        rows = np.flatnonzero((part == number) & (np.isfinite(case.ratings).sum(1) > 1))
+        rows = np.flatnonzero((part == number) & several)
         ratings = case.ratings[rows]
         low, high = alpha_interval(ratings, None if item is None else item[rows]) or (None, None)
         within = between = 0.0
         if rows.size:
-            within = float(np.sqrt(np.nanvar(ratings, 1, ddof=1).mean()))
-            between = float(np.nanmean(ratings, 1).std())
+            mean, count = np.nanmean(ratings, 1), np.isfinite(ratings).sum(1)
+            within = float(np.sqrt((np.nansum((ratings - mean[:, None]) ** 2, 1) / (count - 1)).mean()))
+            between = float(mean.std())
         strata.append(Stratum(str(name), int(rows.size), krippendorff_alpha(ratings), low, high, within, between))
     return tuple(strata)

@@ -69,9 +69,9 @@ def alpha_interval(ratings: object, item: object = None, seed: int = 0) -> tuple
     parts = _parts(ratings, item)
     if parts is None or len(parts) < FEWEST_ITEMS:
         return None
-    parts = parts[np.lexsort(parts.T)]
     items = len(parts)
     if items <= MOST_RESAMPLED:
+        parts = parts[np.lexsort(parts.T)]
         drawn = np.random.default_rng(seed).multinomial(items, np.full(items, 1.0 / items), size=RESAMPLES)
         alphas = _alpha(drawn @ parts)
         low, high = np.quantile(alphas[np.isfinite(alphas)], [0.025, 0.975])

@@ -66,11 +66,16 @@ def shared(ratings: Float[np.ndarray, "n K"]) -> Shared:
     x = np.where(here, x - centre, 0.0)
     spread = np.abs(x).max(0, initial=0.0)
     x = np.where(spread > EXACT, x / np.where(spread > EXACT, spread, 1.0), 0.0)
-    weight = here.astype(float)
-    rows = weight.T @ weight
-    some = np.maximum(rows, 1.0)
-    mean = x.T @ weight / some
-    variance = (x * x).T @ weight / some - mean**2
+    if here.all():  # three products less, which are all the time that this takes
+        rows = np.full((x.shape[1], x.shape[1]), float(len(x)))
+        mean, square = (np.broadcast_to(y.mean(0)[:, None], rows.shape) for y in (x, x * x))
+        some = np.maximum(rows, 1.0)
+    else:
+        weight = here.astype(float)
+        rows = weight.T @ weight
+        some = np.maximum(rows, 1.0)
+        mean, square = (y.T @ weight / some for y in (x, x * x))
+    variance = square - mean**2
     sd = np.sqrt(np.where(variance > EXACT, variance, 0.0))
     both = sd * sd.T
     defined = (both > 0) & (rows >= 3)
