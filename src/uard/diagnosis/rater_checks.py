@@ -13,11 +13,12 @@ from uard.ratings.agreement import krippendorff_alpha
 from uard.ratings.pairs import residuals, shared
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Integer
+    from jaxtyping import Float, Integer
 
 COMPARISONS = 500_000_000  # of two numbers each, when all pairs of raters are compared for equality
 LONG = 10  # rows of a run of one value
 FLAT = 4.0  # times the standard deviation, what the others agree on has: too constant
+MOST_PAIRS = 20  # that are named as copies
 RARE = 1e-4  # how many such runs there would be by chance, in any rater's answers
 
 
@@ -228,8 +229,8 @@ def _improbable_run(case: Case, k: int, rows: Integer[np.ndarray, " n"]) -> tupl
     """Return start and length of the longest run of one value that neither chance nor the rows explain; length 0 if none.
 
     Chance: in random order, fewer than ``RARE`` runs as long would be expected of a value as frequent. The rows: within the
-    run the reward, and the mean of the other raters, have at least half of their variance over all rows, and nearly
-    as large a median distance from the median.
+    run the reward, and the mean of the other raters, have at least two fifths of their variance over all rows, and
+    half of their median distance from the median.
     """
     x = case.ratings[rows, k]
     ends = np.flatnonzero(np.diff(x, append=np.nan) != 0)
@@ -252,13 +253,13 @@ def _improbable_run(case: Case, k: int, rows: Integer[np.ndarray, " n"]) -> tupl
 
 
 def _varies(part: Float[np.ndarray, " m"], whole: Float[np.ndarray, " n"]) -> bool:
-    """Return whether a part has at least half of the variance of the whole; yes if the whole has none or is not known."""
+    """Return whether a part has at least two fifths of the variance of the whole; yes if the whole has none or is not known."""
     part, whole = part[np.isfinite(part)], whole[np.isfinite(whole)]
     if not whole.size or np.ptp(whole) == 0:
         return True
-    if part.size < LONG or part.var() < 0.5 * whole.var():
+    if part.size < LONG or part.var() < 0.4 * whole.var():
         return False
-    return _typical(part) >= np.sqrt(0.5) * _typical(whole)  # a few rewards that lie have most of the variance
+    return _typical(part) >= 0.5 * _typical(whole)  # a few rewards that lie have most of the variance
 
 
 def _typical(x: Float[np.ndarray, " n"]) -> float:
@@ -278,7 +279,8 @@ def too_constant(case: Case) -> Finding | None:
     np.fill_diagonal(told, False)
     covariance, told = np.where(told, covariance, 0.0), told.astype(float)
     total, pairs = covariance.sum() - 2 * covariance.sum(1), told.sum() - 2 * told.sum(1)
-    signal = np.where(pairs > 0, total / np.maximum(pairs, 1.0), 0.0)[:-1]
+    seen = np.minimum(1.0, with_reward.sd[-1] / max(float(with_reward.sd[-1, -1]), 1e-100)) ** 2  # in the rater's own rows
+    signal = (seen * np.where(pairs > 0, total / np.maximum(pairs, 1.0), 0.0))[:-1]
     own = np.array([np.nanvar(x) if np.isfinite(x).sum() >= FEW else np.inf for x in sample.ratings.T])
     unit = units(case)
     alone = np.full(own.size, True) if unit is None else unit < 0
@@ -305,45 +307,47 @@ def too_constant(case: Case) -> Finding | None:
 def copied_ratings(case: Case) -> Finding | None:
     """Two raters whose errors go together far more than those of the others.
 
-    What a reward leaves unexplained of two raters' ratings has a covariance: of what both see and the reward does not.
-    Between honest raters of one scale it is the same for every pair, however noisy each is. A pair copies if its
-    covariance is above every other that either has, by six tenths of the product of their deviations, and not by chance.
-    Rows whose ratings are over a unit from the reward are left out, and a third rater counts only if it follows the
-    reward at least half as closely as the two.
+    What a reward leaves unexplained of two raters' ratings has a covariance: of what both see and the reward does not. In
+    units of how far each follows the reward it is the same for every pair of honest raters, however noisy each is. A pair
+    copies if its covariance is above every other that either has, not by chance, and if what is above is over six tenths
+    of what the others leave unexplained of it. Rows whose ratings are over a unit from the reward are left out, and so
+    are raters who hardly follow it. Between three raters two who see a truth that neither the reward nor the third sees
+    look the same.
     """
     sample = case.sample
     if sample.raters.size < 3:
         return None
     rows = ~case.far()[sample.rows]
-    ratings = np.where(rows[:, None], sample.ratings, np.nan)
     known = sample.reward[:, None] if case.true is None else np.column_stack([sample.reward, case.true[sample.rows]])
-    both = shared(residuals(ratings, known))
-    follows = case.pairs_with_reward.correlation[:-1, -1]
-    spread = both.sd * both.sd.T
-    covariance = np.where(both.rows >= FEW, both.correlation * spread, -np.inf)
-    np.fill_diagonal(covariance, -np.inf)
-    strong = both.correlation - np.eye(len(spread)) * 2.0
-    pairs_compared = max(spread.size / 2, 2)
-    z = np.arctanh(np.clip(strong, -0.999999, 0.999999)) * np.sqrt(np.maximum(both.rows - 3, 0))
-    clear = (strong >= 0.6) & (both.rows >= FEW) & (z > 3.0 + np.sqrt(2.0 * np.log(pairs_compared)))
+    both = shared(residuals(np.where(rows[:, None], sample.ratings, np.nan), known))
+    with_reward = case.pairs_with_reward
+    follows = with_reward.correlation[:-1, -1]
+    slope = follows * with_reward.sd[:-1, -1] / max(float(with_reward.sd[-1, :-1].max()), 1e-100)
+    usable = (follows >= 0.2) & (slope > 0)
+    scale = np.where(usable, slope, 1.0)
+    sd = both.sd / scale[:, None]
+    spread = sd * sd.T
+    told = (both.rows >= FEW) & usable & usable[:, None] & ~np.eye(len(sd), dtype=bool)
+    covariance = np.where(told, both.correlation * spread, -np.inf)
+    chance = (3.0 + np.sqrt(2.0 * np.log(max(told.sum() / 2, 2)))) / np.sqrt(np.maximum(both.rows, 1))
     parts: list[str] = []
     numbers: dict[str, float] = {}
-    for i, j in zip(*np.nonzero(np.triu(clear)), strict=True):
-        if len(parts) >= 20:
-            break
-        third = (follows >= 0.5 * max(follows[i], follows[j])) & (follows > 0)
-        third[[i, j]] = False
-        beside = np.maximum(covariance[i], covariance[j])[third]
-        beside = beside[np.isfinite(beside)]
-        if not beside.size or covariance[i, j] - max(beside.max(), 0.0) < 0.6 * spread[i, j]:
+    for i, j in zip(*np.nonzero(np.triu(told & (both.correlation > np.maximum(chance, 0.5)))), strict=True):
+        third = np.maximum(covariance[i], covariance[j])
+        third[[i, j]] = -np.inf
+        if not np.isfinite(third).any() or len(parts) >= MOST_PAIRS:
+            continue
+        beside = max(float(third.max()), 0.0)
+        above = covariance[i, j] - beside
+        if above < chance[i, j] * spread[i, j] or above < 0.6 * (spread[i, j] - beside):
             continue
         if _equal(sample.ratings[:, i], sample.ratings[:, j], case.unit) >= 0.99:
             continue  # named by idle_raters
         a, b = (case.log.raters[sample.raters[k]] for k in (i, j))
-        parts.append(
-            f"{a} and {b} ({both.correlation[i, j]:.2f}; others at most {_highest(both.correlation, i, j, third):.2f})"
-        )
         numbers[f"correlation_{a}_{b}"] = float(both.correlation[i, j])
+        parts.append(
+            f"{a} and {b} ({both.correlation[i, j]:.2f}, by the other raters at most {beside / spread[i, j]:.2f})"
+        )
     if not parts:
         return None
     return Finding(
@@ -355,8 +359,3 @@ def copied_ratings(case: Case) -> Finding | None:
         "Find out whether they rated alone; keep one of the two, or ask a rater of another kind.",
         numbers,
     )
-
-
-def _highest(correlation: Float[np.ndarray, "m m"], i: int, j: int, third: Bool[np.ndarray, " m"]) -> float:
-    """Return the highest correlation that either of two has with a third."""
-    return float(np.maximum(correlation[i], correlation[j])[third].max())
