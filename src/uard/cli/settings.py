@@ -21,13 +21,15 @@ def settings(pairs: tuple[str, ...], option: str = "--set") -> dict[str, Any]:
     """Read ``name=value`` pairs; values are JSON, or else text.
 
     Raises:
-        InvalidValueError: a pair without ``=``.
+        InvalidValueError: a pair without ``=``, or a name that was there before.
     """
     out: dict[str, Any] = {}
     for pair in pairs:
         name, sign, value = pair.partition("=")
         if not sign or not name:
             raise _checks.InvalidValueError(option, pair, "name=value, such as size=12 or 'traps=[[2,5],[7,3]]'")
+        if name in out:
+            raise _checks.InvalidValueError(option, pair, f"given once for each name: {name} has {out[name]!r} already")
         try:
             out[name] = json.loads(value)
         except json.JSONDecodeError:

@@ -48,6 +48,7 @@ class RatingLog:
         item: What was rated, or None where every row is another thing.
         episode: Name of each row's episode, or None.
         step: Name of each row's step, or None.
+        by: Name of the part of the log that each row belongs to, or None.
         source: Where the log is from.
         repeats: Earlier answers of raters who rated a row more than once, or None.
     """
@@ -60,6 +61,7 @@ class RatingLog:
     item: Shaped[np.ndarray, " n"] | None = None
     episode: Shaped[np.ndarray, " n"] | None = None
     step: Shaped[np.ndarray, " n"] | None = None
+    by: Shaped[np.ndarray, " n"] | None = None
     source: str = "log"
     repeats: Repeats | None = None
 
@@ -80,7 +82,7 @@ class RatingLog:
         if len(raters) != ratings.shape[1]:
             raise _checks.InvalidValueError("raters", raters, f"{ratings.shape[1]} names, one per column of ratings")
         checked: dict[str, Any] = {"reward": reward, "ratings": ratings, "raters": raters}
-        for name in (*NUMBERS, *LABELS):
+        for name in (*NUMBERS, *LABELS, "by"):
             column = getattr(self, name)
             if column is not None:
                 column = _checks.as_numpy(name, column) if name in NUMBERS else np.asarray(column)

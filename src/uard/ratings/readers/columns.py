@@ -65,7 +65,9 @@ class Wanted:
             )
             raise _checks.InvalidValueError("ratings", self.ratings, allowed)
         called_so = self.ratings is None and self.by is not None and self.by.startswith("rating")
-        if self.by is not None and (called_so or self.by in (self.reward, self.rating, *NUMBERS, *(self.ratings or ()))):
+        if self.by is not None and (
+            called_so or self.by in (self.reward, self.rating, *NUMBERS, *(self.ratings or ()))
+        ):
             raise _checks.InvalidValueError("by", self.by, "a column that is neither the reward, a sigma nor a rating")
 
 
