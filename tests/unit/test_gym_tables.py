@@ -126,7 +126,7 @@ def test_building_by_name_starts_from_the_settings_not_from_what_they_led_to():
         names.build("BoatRase")
     with pytest.raises(UnknownNameError, match=r"^environment = 'CartPole'"):
         make("CartPole")
-    with pytest.raises(TypeError, match="speed"):
+    with pytest.raises(InvalidValueError, match="'speed': must be one of "):
         make("BoatRace", speed=1)
 
 

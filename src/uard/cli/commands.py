@@ -20,6 +20,7 @@ OWN = {
     "run": "run.Run",
     "reproduce": "reproduce.Reproduce",
     "doctor": "doctor.Doctor",
+    "preferences": "preferences.Preferences",
     "best-of-n": "best_of_n.BestOfN",
     "leaderboard": "leaderboard.Leaderboard",
     "status": "status.Status",

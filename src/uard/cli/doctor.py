@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from uard import InvalidValueError, __version__
+from uard import InvalidValueError, __version__, _checks
 from uard._support.text import printable
 from uard.cli import terminal
-from uard.cli.settings import Pairs
+from uard.cli.settings import Pairs, Words
 from uard.cli.settings import mitigation as mitigation_named
 from uard.cli.settings import settings as read
 
@@ -31,22 +33,33 @@ class Doctor:
     """
 
     log: Positional[str]
-    """A CSV, JSONL or Parquet file (columns: reward, rating..., and if you have them sigma_m, true_reward, item,
-    episode, step), or the id of a Gymnasium environment, which is rolled out with random actions."""
+    """A CSV, JSON, JSONL or Parquet file (columns: reward, rating..., and if you have them sigma_m, true_reward, item,
+    episode, step; or a row per answer, as annotation tools export them), or the id of a Gymnasium environment, which is
+    rolled out with random actions."""
     reward: str = "reward"
     """The column of rewards."""
     ratings: tuple[str, ...] = ()
     """The annotators' columns; all that start with `rating` if left out."""
+    rater: str | None = None
+    """In a log of one answer per row, the column that says who rated."""
+    item: str | None = None
+    """The column that says what was rated."""
+    rating: str | None = None
+    """In a log of one answer per row, the column of ratings, or the question whose answers are read."""
+    missing: Words = ()
+    """A further word that means that a number is missing, e.g. '?'. Repeatable."""
     mitigation: str = "uard"
     """The filter that is going to be used."""
     set_mitigation: Pairs = ()
     """Change a field of it, e.g. kappa=0. Repeatable."""
+    by: str | None = None
+    """A column of the file that divides the rows into parts; agreement is reported within each."""
     set: Pairs = ()
     """A keyword of the environment, e.g. panel=main. Repeatable."""
-    steps: int = 1000
-    """Steps in the environment."""
-    seed: int = 0
-    """Seed of the environment and of the actions."""
+    steps: int | None = None
+    """Steps in the environment; 1000 if left out."""
+    seed: int | None = None
+    """Seed of the environment and of the actions; 0 if left out."""
     strict: bool = False
     """Let a warning count as a danger."""
     json: str | None = None
@@ -72,22 +85,56 @@ class Doctor:
         """Return the log: of a file if it looks like one, else of an environment."""
         from uard.ratings import readers, rollout
 
-        if Path(self.log).suffix.lower() in readers.FORMATS or os.path.exists(self.log):  # Path's raises
-            return readers.read(self.log, self.reward, self.ratings or None)
-        import gymnasium
-
-        import uard.envs  # noqa: F401  (registers ids)
-
-        keywords = read(self.set)
+        if Path(self.log).suffix.lower() in readers.FORMATS or os.path.exists(self.log):
+            self._only("an environment", "set", "steps", "seed")
+            columns = {"rater": self.rater, "item": self.item, "rating": self.rating, "by": self.by}
+            return readers.read(self.log, self.reward, self.ratings or None, **columns, missing=self.missing)
+        self._only("a file", "reward", "ratings", "rater", "item", "rating", "missing", "by")
+        env = _environment(self.log, read(self.set))
         try:
-            env = gymnasium.make(self.log, **keywords)
-        except gymnasium.error.Error as error:
-            endings = ", ".join(readers.FORMATS)
-            allowed = f"a file that ends in {endings}, or the id of a Gymnasium environment ({error})"
-            raise InvalidValueError("log", self.log, allowed) from None
-        except TypeError as error:  # an unknown keyword
-            raise InvalidValueError("set", dict(keywords), f"keywords of {self.log} ({error})") from None
-        try:
-            return rollout.rollout(env, self.steps, self.seed)
+            return rollout.rollout(
+                env, 1000 if self.steps is None else self.steps, 0 if self.seed is None else self.seed
+            )
         finally:
             env.close()
+
+    def _only(self, what: str, *options: str) -> None:
+        """Refuse options that do not apply to the log.
+
+        Raises:
+            InvalidValueError: naming the option.
+        """
+        defaults = {f.name: f.default for f in fields(self)}
+        for name in options:
+            if (value := getattr(self, name)) != defaults[name]:
+                raise InvalidValueError(f"--{name}", value, f"left out: it is for {what}, and {self.log} is none")
+
+
+def _environment(name: str, keywords: dict[str, Any]) -> Any:
+    """Return an environment by its id.
+
+    Raises:
+        InvalidValueError: there is none of that name, or it has no such keyword (the message lists those it has).
+    """
+    import gymnasium
+    from gymnasium.envs.registration import load_env_creator
+
+    import uard.envs  # noqa: F401  (registers ids)
+    from uard.ratings import readers
+
+    module, colon, known = name.rpartition(":")
+    try:
+        if colon:
+            importlib.import_module(module)
+        if (spec := gymnasium.registry.get(known)) is not None:
+            creator: Any = spec.entry_point
+            known_to = inspect.signature(load_env_creator(creator) if isinstance(creator, str) else creator).parameters
+            for keyword in () if any(p.kind is p.VAR_KEYWORD for p in known_to.values()) else keywords:
+                _checks.choose(f"keyword of {name}", keyword, known_to)
+        return gymnasium.make(known, **keywords)
+    except InvalidValueError:
+        raise
+    except (gymnasium.error.Error, ImportError, AttributeError, TypeError, ValueError) as error:
+        endings = ", ".join(readers.FORMATS)
+        allowed = f"a file that ends in {endings}, or the id of a Gymnasium environment ({error})"
+        raise InvalidValueError("log", name, allowed) from None

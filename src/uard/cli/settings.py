@@ -14,6 +14,7 @@ from uard._support.fields import changed
 from uard.method.mitigations import Mitigation, named
 
 Pairs = Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=VALUE")]
+Words = Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="WORD")]
 Names = Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME")]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from uard.method.mitigations import Evidence, Mitigation, named
 from uard.method.weights import discount
 from uard.ratings.aggregate import aggregate, by_item
 from uard.ratings.log import RatingLog
+from uard.ratings.pairs import Shared, sample_of_raters, sample_of_rows, shared
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Integer, Shaped
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 PRINTED = "uard-operator"
 PAIRS = 200_000  # most pairs of rows that are compared
 LARGEST = 1e100  # no reward is as large, and the squares of larger numbers overflow
+SMALLEST = 1e-100  # smaller numbers are taken for 0: their squares vanish
 ROUNDING = 1e-6  # of a unit: logs are often written in single precision
 FEW = 30  # with fewer rated rows no statistic means much
 
@@ -41,6 +44,24 @@ class FilterOutcome(NamedTuple):
     learned: Float[np.ndarray, " n"]
 
 
+class Sample(NamedTuple):
+    """Part of a log, small enough that all pairs of its raters can be compared; the whole of a small log.
+
+    Attributes:
+        rows: Numbers of its rows among those of the case.
+        raters: Numbers of its m raters.
+        reward: Rewards of its rows.
+        ratings: Ratings of its rows, NaN where one is missing.
+        others: Mean rating of all other raters of the log; NaN where nobody else rated.
+    """
+
+    rows: Integer[np.ndarray, " n"]
+    raters: Integer[np.ndarray, " m"]
+    reward: Float[np.ndarray, " n"]
+    ratings: Float[np.ndarray, "n m"]
+    others: Float[np.ndarray, "n m"]
+
+
 @dataclass(frozen=True)
 class Case:
     """A log of which only usable numbers are left, and what the filters make of it.
@@ -56,7 +77,7 @@ class Case:
         distinct: What is known of every distinct item.
         rated: Whether anybody has rated the row's item.
         together: Whether at least two raters have rated one row of the item, so that they can be compared.
-        unit: Standard deviation of the rewards; 1 if all are equal.
+        unit: Standard deviation of the rewards, or of the ratings if the log holds no rewards; 1 if all are equal.
         noise: How far the mean of a row's ratings may be from what raters mean: so many of its median standard errors
             that among all rows hardly one gets there by chance.
         chosen: The filter that is going to be used.
@@ -84,6 +105,28 @@ class Case:
         """Return where a row is, in words."""
         return self.log.place(int(self.rows[row]))
 
+    @cached_property
+    def sample(self) -> Sample:
+        """What the checks of raters look at."""
+        raters = sample_of_raters(self.ratings.shape[1])
+        rows = sample_of_rows(len(self.reward), raters.size)
+        ratings = self.ratings[rows]
+        count, total = np.isfinite(ratings).sum(1)[:, None], np.nansum(ratings, 1)[:, None]
+        ratings = ratings[:, raters]
+        beside = count - np.isfinite(ratings)
+        others = np.where(beside > 0, (total - np.nan_to_num(ratings)) / np.maximum(beside, 1), np.nan)
+        return Sample(rows, raters, self.reward[rows], ratings, others)
+
+    @cached_property
+    def pairs_with_reward(self) -> Shared:
+        """What the raters of the sample, and the reward as one more, have in common."""
+        return shared(np.column_stack([self.sample.ratings, self.sample.reward]))
+
+    @property
+    def pairs_of_raters(self) -> Shared:
+        """What the raters of the sample have in common."""
+        return Shared._make(x[:-1, :-1] for x in self.pairs_with_reward)
+
     def gap(self) -> Float[np.ndarray, " n"]:
         """Return the reward minus the mean rating; 0 where nobody rated."""
         return np.where(self.rated, self.reward - self.feedback.mean, 0.0)
@@ -102,6 +145,11 @@ def usable(x: Float[np.ndarray, "*any"]) -> Bool[np.ndarray, "*any"]:
     return np.abs(x) < LARGEST
 
 
+def _usable(x: Float[np.ndarray, "*any"], otherwise: float) -> Float[np.ndarray, "*any"]:
+    """Return the usable numbers, something else in the place of the others, and 0 for what is too small."""
+    return np.where(usable(x), np.where(np.abs(x) < SMALLEST, 0.0, x), otherwise)
+
+
 def case_of(log: RatingLog, name: str, method: Mitigation) -> Case:
     """Leave out the rows and cells that hold no usable number, and put the rest through the filters.
 
@@ -113,12 +161,14 @@ def case_of(log: RatingLog, name: str, method: Mitigation) -> Case:
     Raises:
         InvalidValueError: no reward is a number.
     """
+    if log.reward is None:
+        return _without_reward(log, name, method)
     rows = np.flatnonzero(usable(log.reward))
     if not rows.size:
         raise _checks.InvalidValueError(f"{log.source}: column of rewards", "no number", "finite numbers")
-    reward, ratings = log.reward[rows], np.where(usable(log.ratings[rows]), log.ratings[rows], np.nan)
-    sigma_m = None if log.sigma_m is None else np.where(usable(log.sigma_m), log.sigma_m, 0.0)[rows]
-    true = None if log.true_reward is None else np.where(usable(log.true_reward), log.true_reward, np.nan)[rows]
+    reward, ratings = _usable(log.reward[rows], np.nan), _usable(log.ratings[rows], np.nan)
+    sigma_m = None if log.sigma_m is None else _usable(log.sigma_m, 0.0)[rows]
+    true = None if log.true_reward is None else _usable(log.true_reward, np.nan)[rows]
     item = None if log.item is None else numbered(log.item[rows])
     known, distinct = feedback_of(reward, ratings, item)
     together = np.isfinite(ratings).sum(1) >= 2
@@ -145,6 +195,33 @@ def case_of(log: RatingLog, name: str, method: Mitigation) -> Case:
         chosen=outcome(name, method),
         printed=outcome(PRINTED, as_filter(PRINTED)),
         recommended=outcome("uard", as_filter("uard")),
+    )
+
+
+def _without_reward(log: RatingLog, name: str, method: Mitigation) -> Case:
+    """Return the case of a log that holds no rewards: they are NaN, and so is all that filters make of them."""
+    unknown = np.full(len(log), np.nan)
+    ratings = _usable(log.ratings, np.nan)
+    known, distinct = feedback_of(unknown, ratings, None)
+    here = np.isfinite(ratings)
+    outcomes = [FilterOutcome(n, m, unknown, unknown) for n, m in ((name, method), (PRINTED, as_filter(PRINTED)))]
+    deviation = float(ratings[here].std()) if here.any() else 0.0
+    return Case(
+        log=log,
+        rows=np.arange(len(log)),
+        reward=unknown,
+        ratings=ratings,
+        sigma_m=None,
+        true=None,
+        feedback=known,
+        distinct=distinct,
+        rated=known.count > 0,
+        together=here.sum(1) >= 2,
+        unit=deviation or 1.0,
+        noise=0.0,
+        chosen=outcomes[0],
+        printed=outcomes[1],
+        recommended=outcomes[0],
     )
 
 

@@ -17,12 +17,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uard import _checks
-from uard.diagnosis import filter_checks, log_checks
+from uard.diagnosis import agreement_checks, filter_checks, log_checks, rater_checks, truth_checks
 from uard.diagnosis.case import Case, as_filter, case_of, feedback_of, filtered_rows, numbered
 from uard.diagnosis.finding import SEVERITIES, Diagnosis, Finding
+from uard.diagnosis.self_consistency import self_consistency
+from uard.diagnosis.strata import strata_of
 from uard.method.mitigations import Mitigation
 from uard.ratings import readers
-from uard.ratings.agreement import krippendorff_alpha
+from uard.ratings.agreement import Independence, alpha_interval, independence, krippendorff_alpha
 from uard.ratings.log import RatingLog
 
 if TYPE_CHECKING:
@@ -35,6 +37,11 @@ def doctor(
     *,
     reward: str = "reward",
     ratings: Sequence[str] | None = None,
+    rater: str | None = None,
+    item: str | None = None,
+    rating: str | None = None,
+    missing: Sequence[str] = (),
+    by: str | None = None,
 ) -> Diagnosis:
     """Name every known trap that a log of rewards and ratings is in.
 
@@ -44,33 +51,54 @@ def doctor(
         ['reward-contradicted']
 
     Args:
-        log: A ``uard.ratings.log.RatingLog``; the path of a CSV, JSONL or Parquet file; or named columns. See
-            ``uard.ratings.readers`` for the columns.
+        log: A ``uard.ratings.log.RatingLog``; the path of a CSV, JSON, JSONL or Parquet file; or named columns. See
+            ``uard.ratings.readers`` for the columns. Of a log without rewards only the raters are checked.
         mitigation: The filter that is going to be used: the name of one, or a ``Mitigation``.
         reward: Name of the column of rewards, for a file or columns.
         ratings: Names of the annotators' columns, likewise; all that start with ``rating`` if left out.
+        rater: For a file or columns of one answer per row: the column that says who rated.
+        item: Likewise the column that says what was rated.
+        rating: Likewise the column of ratings, or the question whose answers are read.
+        missing: Further words that mean that a number is missing.
+        by: Name of a column, likewise, that divides the rows into parts; agreement is reported within each. A
+            ``RatingLog`` has its own.
 
     Raises:
         InvalidValueError: the log cannot be read (the message names row and column), no reward in it is a number, or
-            the mitigation is no reliability filter.
+            the mitigation is no reliability filter; ``by`` names more than 50 parts.
     """
     if isinstance(log, str | Path):
-        log = readers.read(log, reward, ratings)
+        log = readers.read(log, reward, ratings, rater=rater, item=item, rating=rating, missing=missing, by=by)
     elif not isinstance(log, RatingLog):
-        log = readers.from_columns(log, reward, ratings)
+        log = readers.from_columns(log, reward, ratings, rater=rater, item=item, rating=rating, missing=missing, by=by)
+    elif by is not None:
+        raise _checks.InvalidValueError("by", by, "left out: the log has its own, RatingLog(by=...)")
     name = mitigation if isinstance(mitigation, str) else "your filter"
     case = case_of(log, name, as_filter(mitigation))
-    found = [log_checks.not_finite(log), *(check(case) for check in CHECKS)]
+    agreement, strata = krippendorff_alpha(case.ratings), strata_of(case)
+    found = [log_checks.not_finite(log), *(check(case) for check in (RATER_CHECKS if log.reward is None else CHECKS))]
+    found.append(agreement_checks.uneven_agreement(strata, agreement))
     return Diagnosis(
         source=log.source,
         mitigation=name if isinstance(mitigation, str) else repr(mitigation),
         rows=len(log),
         raters=log.raters,
         rated=float(case.rated.mean()),
-        agreement=krippendorff_alpha(case.ratings),
-        calibration=log_checks.calibration_of(case),
+        agreement=agreement,
+        agreement_interval=alpha_interval(case.ratings, None if log.item is None else log.item[case.rows]),
+        strata=strata,
+        independence=_independence(case),
+        calibration=truth_checks.calibration_of(case),
         findings=tuple(sorted((f for f in found if f is not None), key=lambda f: SEVERITIES.index(f.severity))),
     )
+
+
+def _independence(case: Case) -> Independence | None:
+    if case.log.reward is None:
+        return None
+    if case.true is not None:
+        return independence(case.ratings, case.true, "true_reward")
+    return independence(case.ratings, case.reward, "reward")
 
 
 def filtered(log: RatingLog, mitigation: str | Mitigation = "uard") -> Float[np.ndarray, " n"]:
@@ -89,28 +117,48 @@ def filtered(log: RatingLog, mitigation: str | Mitigation = "uard") -> Float[np.
         InvalidValueError: a reward is NaN or infinite, a rating or sigma_m is infinite (the message names the row), or
             the mitigation is no reliability filter.
     """
+    if log.reward is None:
+        raise _checks.InvalidValueError("reward", None, f"there: {log.source} holds no rewards that could be filtered")
     _checks.finite("reward", log.reward)
     _checks.finite("ratings", np.where(np.isnan(log.ratings), 0.0, log.ratings))
     known, distinct = feedback_of(log.reward, log.ratings, numbered(log.item))
     return filtered_rows(as_filter(mitigation), log.reward, log.sigma_m, known, distinct)[1]
 
 
+RATER_CHECKS: tuple[Callable[[Case], Finding | None], ...] = (
+    log_checks.no_rewards,
+    log_checks.few_ratings,
+    log_checks.missing_ratings,
+    rater_checks.idle_raters,
+    rater_checks.sentinel_value,
+    agreement_checks.mixed_units,
+    agreement_checks.one_rater,
+    self_consistency,
+)
+"""What can be checked without rewards."""
 CHECKS: tuple[Callable[[Case], Finding | None], ...] = (
     log_checks.few_ratings,
     log_checks.missing_ratings,
-    log_checks.idle_raters,
-    log_checks.one_rater,
-    log_checks.contradicted,
-    log_checks.colluding,
+    rater_checks.idle_raters,
+    rater_checks.sentinel_value,
+    rater_checks.straight_lines,
+    rater_checks.too_constant,
+    rater_checks.copied_ratings,
+    agreement_checks.mixed_units,
+    agreement_checks.one_rater,
+    self_consistency,
+    agreement_checks.contradicted,
+    truth_checks.colluding,
     log_checks.dead_ensemble,
-    log_checks.blind_sigma,
+    truth_checks.blind_sigma,
     lambda case: filter_checks.by_setting(case, filter_checks.smaller_penalties),
     lambda case: filter_checks.by_setting(case, filter_checks.origin_and_unit),
     lambda case: filter_checks.by_setting(case, filter_checks.lie_still_pays),
     lambda case: filter_checks.by_setting(case, filter_checks.saturated),
 )
 CODES = (
-    "not-finite", "no-ratings", "few-ratings", "missing-ratings", "idle-raters", "one-rater", "reward-contradicted",
-    "other-units", "colluding-raters", "dead-ensemble", "blind-sigma", "smaller-penalties", "origin-and-unit",
-    "lie-still-pays", "saturated-weights",
+    "not-finite", "no-ratings", "few-ratings", "missing-ratings", "idle-raters", "sentinel-value", "straight-lining",
+    "too-constant", "copied-ratings", "mixed-units", "uneven-agreement", "one-rater", "self-consistency", "no-rewards",
+    "reward-contradicted", "other-units", "colluding-raters", "dead-ensemble", "blind-sigma", "smaller-penalties",
+    "origin-and-unit", "lie-still-pays", "saturated-weights",
 )  # fmt: skip

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
+
+from uard.ratings.agreement import Independence
 
 Severity = Literal["danger", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("danger", "warning", "note")
@@ -38,6 +40,33 @@ class Finding:
 
 
 @dataclass(frozen=True)
+class Stratum:
+    """How far raters agree within a part of a log.
+
+    Examples:
+        >>> Stratum("bart", rows=100, agreement=0.28, low=0.1, high=0.4, within=12.0, between=11.0).name
+        'bart'
+
+    Attributes:
+        name: What the rows of the part have in the column.
+        rows: How many of them at least two raters have rated.
+        agreement: Krippendorff's alpha of these rows, <= 1; None where it is not defined.
+        low: Lower end of its 95 % interval; None below ten items.
+        high: Upper end, likewise.
+        within: Standard deviation of the ratings of one row (their number less one), in rating units.
+        between: Standard deviation of the rows' mean ratings, in rating units.
+    """
+
+    name: str
+    rows: int
+    agreement: float | None
+    low: float | None
+    high: float | None
+    within: float
+    between: float
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """What the doctor found; ``str(diagnosis)`` is all of it in words.
 
@@ -56,6 +85,10 @@ class Diagnosis:
         raters: Names of the annotators.
         rated: Share of rows that somebody rated, in [0, 1].
         agreement: Krippendorff's alpha (interval metric) of the annotators, <= 1; None where it is not defined.
+        agreement_interval: Its 95 % interval over items, see ``uard.ratings.agreement.alpha_interval``, or None.
+        strata: The same within each part of the rows, if a column divides them.
+        independence: How many independent raters these are worth, see ``uard.ratings.agreement.independence``: against
+            the true reward if it is known, else against the observed one; None where that cannot be told.
         calibration: How well sigma predicts |reward - true reward| on rated rows; None without a true reward. For
             ``sigma_h`` alone, ``sigma_h_with_proxy`` (the reward counted as one more rater) and ``sigma_m`` (if
             logged): ``spearman`` and, where there are lies and honest rows, ``auroc`` (a lie is off by over a unit).
@@ -68,6 +101,9 @@ class Diagnosis:
     raters: tuple[str, ...]
     rated: float
     agreement: float | None
+    agreement_interval: tuple[float, float] | None
+    strata: tuple[Stratum, ...]
+    independence: Independence | None
     calibration: Mapping[str, Mapping[str, float]] | None
     findings: tuple[Finding, ...]
 
@@ -77,7 +113,10 @@ class Diagnosis:
 
     def as_data(self) -> dict[str, Any]:
         """Return everything as plain data that JSON can hold."""
-        return asdict(self) | {"raters": list(self.raters), "findings": [asdict(f) for f in self.findings]}
+        data = asdict(self)
+        if self.independence is not None:
+            data["independence"]["effective"] = self.independence.effective
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in data.items()}
 
     def __str__(self) -> str:
         """Return the whole diagnosis as text, 100 columns wide."""
@@ -86,8 +125,17 @@ class Diagnosis:
         lines = [f"{self.source}: {self.rows} rows, {who}{names}, {percent(self.rated)} of rows rated"]
         alpha = "not defined (fewer than two ratings of anything, or all ratings equal)"
         if self.agreement is not None:
-            alpha = f"{self.agreement:.3f} (1 perfect, 0 chance; below 0.667 by custom too low to rely on)"
+            between = interval(*self.agreement_interval or (None, None))
+            alpha = f"{self.agreement:.3f} ({between}1 perfect, 0 chance; below 0.667 by custom too low to rely on)"
         lines.append(f"agreement   Krippendorff's alpha {alpha}")
+        for s in self.strata:
+            alpha = "not defined" if s.agreement is None else f"{s.agreement:.3f}"
+            lines.append(f"            within {s.name}: {alpha} ({interval(s.low, s.high)}{row_count(s.rows)})")
+        if (i := self.independence) is not None:
+            lines.append(
+                f"raters      a row's {i.raters:.3g} are worth {i.effective:.3g} independent ones (mean correlation of "
+                f"errors against {i.against} {i.correlation:.2f})"
+            )
         for sigma, values in (self.calibration or {}).items():
             shown = ", ".join(f"{name} {value:.3f}" for name, value in values.items())
             lines.append(f"calibration {sigma.replace('_with_proxy', ' with the reward as a rater')}: {shown}")
@@ -106,6 +154,18 @@ def percent(share: float) -> str:
     """Return a share in [0, 1] as text: ``12.5 %``."""
     text = f"{100 * share:.1f}"
     return f"{100 * share:.2g} %" if text == "0.0" and share > 0 else f"{text.removesuffix('.0')} %"
+
+
+def interval(low: float | None, high: float | None) -> str:
+    """Return a 95 % interval as the beginning of a text: ``95 %: 0.71 to 0.83; ``; nothing if there is none."""
+    return "" if low is None or high is None else f"95 %: {low:.2f} to {high:.2f}; "
+
+
+def listed(parts: Iterable[str], most: int = 8) -> str:
+    """Return parts as text, no more than ``most`` of them: ``a, b and 3 more``."""
+    several = list(parts)
+    more = f" and {len(several) - most} more" if len(several) > most else ""
+    return ", ".join(several[:most]) + more
 
 
 def row_count(n: int) -> str:

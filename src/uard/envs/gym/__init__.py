@@ -14,6 +14,7 @@ as are ``panel``, ``noise`` and ``render_mode``. MuJoCo is needed only to make w
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import gymnasium
@@ -65,7 +66,11 @@ def make(
     Raises:
         InvalidValueError: naming the field, the value and what is allowed.
     """
-    problem = names.build(_checks.choose("environment", environment, IDS.values()), **fields)
+    kind, _ = names.KINDS[_checks.choose("environment", environment, IDS.values())]
+    for field in fields:
+        known = [f.name for f in dataclasses.fields(kind) if f.init]
+        _checks.choose(f"keyword of {environment}", field, [*known, "panel", "noise", "render_mode"])
+    problem = names.build(environment, **fields)
     form: Any = SimulatedEnv if isinstance(problem, SimulatedEnvironment) else GridEnv
     return form(problem, panel=panel, noise=noise, render_mode=render_mode)
 

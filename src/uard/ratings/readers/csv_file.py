@@ -1,29 +1,26 @@
-"""CSV."""
+"""CSV and TSV."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from uard import _checks
-from uard.ratings.log import LABELS, bad_cell
-from uard.ratings.readers.columns import A_NUMBER, Wanted, no_binary
+from uard.ratings.readers.columns import Choice, Numbers, no_binary
 
-_MISSING = frozenset(("", "nan", "na", "n/a", "null", "none"))
 _CHUNK = 50_000  # rows of text that are held at a time
 
 
-def read_csv(path: Path, wanted: Wanted) -> dict[str, Any]:
-    """Return the wanted columns of a CSV file, in chunks so that its text is never held whole.
+def read_csv(path: Path, choice: Choice, numbers: Numbers) -> tuple[dict[str, Any], list[str]]:
+    """Return the chosen columns of a CSV file, and the names of all; its text is held in chunks, never whole.
 
     Raises:
-        InvalidValueError: there is no header, a column is missing, a row has another number of cells, or a cell is no
-            number; the message names row and column.
+        InvalidValueError: there is no header, a column is missing, or a row has another number of cells.
     """
     with path.open(encoding="utf-8-sig", newline="") as file:
         first = file.readline()
@@ -31,50 +28,37 @@ def read_csv(path: Path, wanted: Wanted) -> dict[str, Any]:
             raise _checks.InvalidValueError("log", str(path), "a CSV file whose first line names its columns")
         no_binary(first, path)
         separator = max(",;\t", key=first.count)
-        names = [name.strip() for name in next(csv.reader([first], delimiter=separator))]
-        wanted.check(names)
-        places = [(names.index(n), n) for n in dict.fromkeys(names) if wanted.has(n)]
-        parts: dict[str, list[Any]] = {n: [] for _, n in places}
+        chunks = _chunks(csv.reader(chain([first], file), delimiter=separator), path)
+        names = [name.strip() for name in next(chunks)[0]]
+        as_numbers, as_texts = choice.columns(names)
+        parts: dict[str, list[Any]] = {n: [] for n in (*as_numbers, *as_texts)}
+        same: dict[str, str] = {}  # names come again and again, and one text is enough
         start = 0
-        for rows in _chunks(csv.reader(file, delimiter=separator), path):
+        for rows in chunks:
             if set(map(len, rows)) != {len(names)}:
                 i = next(i for i, row in enumerate(rows) if len(row) != len(names))
                 allowed = f"{len(names)} cells, as the header has"
                 raise _checks.InvalidValueError(f"{path}: row {start + i + 1}", separator.join(rows[i]), allowed)
-            for place, name in places:
-                cells = [row[place] for row in rows]
-                parts[name].append(cells if name in LABELS else _parsed(cells, start, name, str(path)))
+            for name in as_numbers:
+                place = names.index(name)
+                parts[name].append(numbers.of_text([row[place] for row in rows], name, start))
+            for name in as_texts:
+                place = names.index(name)
+                parts[name] += [same.setdefault(row[place], row[place]) for row in rows]
             start += len(rows)
-    return {
-        n: [x for p in part for x in p] if n in LABELS else np.concatenate([np.zeros(0), *part])
-        for n, part in parts.items()
-    }
+    return parts | {n: np.concatenate([np.zeros(0), *parts[n]]) for n in as_numbers}, names
 
 
 def _chunks(reader: Iterator[list[str]], path: Path) -> Iterator[list[list[str]]]:
-    """Yield rows in chunks; empty lines are no rows."""
+    """Yield the header, then rows in chunks; empty lines are no rows."""
     full = (row for row in reader if row)
+    size = 1
     while True:
         try:
-            rows = list(islice(full, _CHUNK))
+            rows = list(islice(full, size))
         except csv.Error as error:
             raise _checks.InvalidValueError("log", str(path), f"a CSV file ({error})") from None
         if not rows:
             return
         yield rows
-
-
-def _parsed(cells: list[str], start: int, column: str, source: str) -> np.ndarray:
-    try:
-        return np.array([float(cell or "nan") for cell in cells])
-    except ValueError:
-        return np.array([_from_text(cell, start + i, column, source) for i, cell in enumerate(cells)])
-
-
-def _from_text(cell: str, row: int, column: str, source: str) -> float:
-    try:
-        return float(cell)
-    except ValueError:
-        if cell.strip().lower() in _MISSING:
-            return np.nan
-        raise bad_cell(source, row, column, cell, A_NUMBER) from None
+        size = _CHUNK
