@@ -34,6 +34,20 @@ class Wanted:
     ratings: tuple[str, ...] | None
     by: str | None = None
 
+    def __post_init__(self) -> None:
+        """Check that the rows are not divided by a column of numbers.
+
+        Raises:
+            InvalidValueError: they are.
+        """
+        if self.by is not None and (self.by in (self.reward, *NUMBERS) or self._is_rating(self.by)):
+            raise _checks.InvalidValueError("by", self.by, "a column that is neither the reward, a sigma nor a rating")
+
+    def _is_rating(self, name: str) -> bool:
+        if self.ratings is None:
+            return name.startswith("rating")
+        return name in self.ratings
+
     @property
     def labels(self) -> tuple[str, ...]:
         """Return the names of the columns that are read as text."""
@@ -45,7 +59,7 @@ class Wanted:
 
     def among(self, names: Iterable[str]) -> list[str]:
         """Return the annotators' columns among ``names``; ``x[0]`` is a part of ``x``."""
-        others = [n for n in names if n not in (self.reward, self.by)]
+        others = [n for n in names if n != self.reward]
         if self.ratings is None:
             return [n for n in others if n.startswith("rating")]
         return [n for r in self.ratings for n in others if n == r or n.startswith(f"{r}[")]
