@@ -27,7 +27,7 @@ def idle_raters(case: Case) -> Finding | None:
     idle: list[str] = []
     numbers: dict[str, float] = {}
     reward, ratings = case.sample.reward, case.sample.ratings
-    names = [case.log.raters[k] for k in case.sample.raters]
+    names = case.sample.names
     alike = _look_alike(case)
     for k, name in enumerate(names):
         column = ratings[:, k]
@@ -72,7 +72,7 @@ def _look_alike(case: Case) -> list[list[int]]:
     """
     ratings = case.sample.ratings
     n, raters = ratings.shape
-    rows = np.unique(np.linspace(0, n - 1, min(n, max(100, 2 * COMPARISONS // max(raters, 1) ** 2))).astype(int))
+    rows = np.unique(np.linspace(0, n - 1, min(n, max(100, 2 * COMPARISONS // max(raters, 1) ** 2)), dtype=int))
     values = ratings[rows].T
     here = np.isfinite(values)
     rounded = np.round(np.where(here, values, 0.0) / (100 * ROUNDING * case.unit))
@@ -286,7 +286,7 @@ def too_constant(case: Case) -> Finding | None:
     flat = np.flatnonzero((own > 0) & (own * FLAT**2 < signal) & alone & (both.rows.diagonal() >= FEW))
     if not flat.size:
         return None
-    names = [case.log.raters[sample.raters[k]] for k in flat]
+    names = [sample.names[k] for k in flat]
     spread = [(float(np.sqrt(own[k])), float(np.sqrt(signal[k]))) for k in flat]
     return Finding(
         "too-constant",
@@ -345,7 +345,7 @@ def copied_ratings(case: Case) -> Finding | None:
             continue
         if _equal(sample.ratings[:, i], sample.ratings[:, j], case.unit) >= 0.99:
             continue  # named by idle_raters
-        a, b = (case.log.raters[sample.raters[k]] for k in (i, j))
+        a, b = sample.names[int(i)], sample.names[int(j)]
         numbers[f"correlation_{a}_{b}"] = float(both.correlation[i, j])
         parts.append(
             f"{a} and {b} ({both.correlation[i, j]:.2f}, by the other raters at most {beside / spread[i, j]:.2f})"
