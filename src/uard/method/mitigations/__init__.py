@@ -4,6 +4,7 @@ from uard.method.feedback import ByRater, Feedback
 from uard.method.mitigations.baselines import RatedReward, Raw, Screening
 from uard.method.mitigations.discounting import RewardDiscounting, uard, uard_paper
 from uard.method.mitigations.panel_statistics import PanelStatistics
+from uard.method.mitigations.pooled import PooledDiscounting
 from uard.method.mitigations.protocol import Backup, Evidence, Explanation, LearningSignal, Mitigation
 from uard.method.mitigations.registry import NAMED, is_mitigation, named
 
@@ -17,6 +18,7 @@ __all__ = [
     "LearningSignal",
     "Mitigation",
     "PanelStatistics",
+    "PooledDiscounting",
     "RatedReward",
     "Raw",
     "RewardDiscounting",

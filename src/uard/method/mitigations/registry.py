@@ -9,6 +9,7 @@ from typing import Any
 from uard import plugins
 from uard.method.mitigations.baselines import RatedReward, Raw, Screening
 from uard.method.mitigations.discounting import uard, uard_paper
+from uard.method.mitigations.pooled import PooledDiscounting
 from uard.method.mitigations.protocol import Mitigation
 
 NAMED: dict[str, Callable[..., Mitigation]] = {
@@ -17,6 +18,7 @@ NAMED: dict[str, Callable[..., Mitigation]] = {
     "worst-of-annotations": partial(RatedReward, statistic="lowest"),
     "lcb": partial(RatedReward, statistic="bound"),
     "screening": Screening,
+    "pooled": PooledDiscounting,
     "uard": uard,
     "uard-paper": uard_paper,
     "uard-consistent": partial(uard_paper, backup="consistent"),
