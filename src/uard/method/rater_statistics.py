@@ -67,7 +67,7 @@ def fit(reward: Float[Array, " n"], by_rater: ByRater, rated: Bool[Array, " n"])
     if every > 1:
         reward, rated, by_rater = reward[::every], rated[::every], ByRater._make(x[::every] for x in by_rater)
     here = (by_rater.count > 0) & rated[:, None]
-    count, said = xp.where(here, by_rater.count, 0.0 * by_rater.count), by_rater.mean
+    count, said = xp.where(here, by_rater.count, xp.zeros_like(by_rater.count)), by_rater.mean
     centre = masked_mean(reward, rated)
     deviation = xp.sqrt(masked_mean((reward - centre) ** 2, rated))
     scale = xp.where(deviation > 0, deviation, xp.ones_like(deviation))
@@ -107,7 +107,7 @@ def answer_variance(count: Float[Array, "n K"], m2: Float[Array, "n K"], scale: 
     """
     xp = namespace(count)
     freedom = xp.maximum(count - 1.0, 0.0 * count)
-    square = xp.where(count > 0, m2, 0.0 * m2)
+    square = xp.where(count > 0, m2, xp.zeros_like(m2))
     pooled = (xp.sum(square) + 0.01 * scale * scale) / (xp.sum(freedom) + 1.0)
     return (xp.sum(square, axis=0) + 3.0 * pooled) / (xp.sum(freedom, axis=0) + 3.0)
 
@@ -206,7 +206,7 @@ def leave_one_out_medians(
 
     last = ranked.shape[-1] - 2
     low, high = xp.clip((left - 1) // 2, 0, last), xp.clip(left // 2, 0, last)
-    return xp.where(here, 0.5 * without(low) + 0.5 * without(high), 0.0 * said)
+    return xp.where(here, 0.5 * without(low) + 0.5 * without(high), xp.zeros_like(said))
 
 
 def masked_median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis: int = 0) -> Float[Array, "*rest"]:

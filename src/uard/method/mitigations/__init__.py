@@ -7,12 +7,14 @@ from uard.method.mitigations.panel_statistics import PanelStatistics
 from uard.method.mitigations.pooled import PooledDiscounting
 from uard.method.mitigations.protocol import Backup, Evidence, Explanation, LearningSignal, Mitigation
 from uard.method.mitigations.registry import NAMED, is_mitigation, named
+from uard.method.mitigations.robust import ExcessDisagreement, RaterCap
 
 __all__ = [
     "NAMED",
     "Backup",
     "ByRater",
     "Evidence",
+    "ExcessDisagreement",
     "Explanation",
     "Feedback",
     "LearningSignal",
@@ -20,6 +22,7 @@ __all__ = [
     "PanelStatistics",
     "PooledDiscounting",
     "RatedReward",
+    "RaterCap",
     "Raw",
     "RewardDiscounting",
     "Screening",

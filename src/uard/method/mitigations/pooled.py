@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from uard import _checks
-from uard.method import pooled, rater_statistics
+from uard.method import pooled
 from uard.method.arrays import Array, namespace
 from uard.method.feedback import ByRater, Feedback
 from uard.method.mitigations.protocol import Evidence, Explanation, LearningSignal, Mitigation
+from uard.method.mitigations.robust import each_rater, fit_raters
 from uard.method.rater_statistics import RaterStatistics, masked_median
 
 if TYPE_CHECKING:
@@ -82,23 +83,22 @@ class PooledDiscounting(Mitigation):
 
     def fit(self, feedback: Feedback, rated: Bool[Array, "*batch"]) -> Believed:
         """Measure the raters, and what is usual."""
-        xp, each = namespace(feedback.mean), _each(feedback)
-        reward, rated = xp.reshape(feedback.proxy, (-1,)), xp.reshape(rated, (-1,))
-        flat = ByRater._make(xp.reshape(x, (-1, x.shape[-1])) for x in each)
-        raters = rater_statistics.fit(reward, flat, rated)
-        learned = self._learned(reward, flat, 0.0 * reward, Believed(raters, 0.0 * raters.scale))
-        return Believed(raters, masked_median(learned[0], rated))
+        raters = fit_raters(feedback, rated)
+        r = feedback.proxy
+        learned = self._learned(r, each_rater(feedback), 0.0 * r, Believed(raters, 0.0 * raters.scale))[0]
+        xp = namespace(learned)
+        return Believed(raters, masked_median(xp.reshape(learned, (-1,)), xp.reshape(rated, (-1,))))
 
     def signal(self, evidence: Evidence, statistics: Believed) -> LearningSignal:
         """Return what is learned."""
         return LearningSignal(
-            self._learned(evidence.reward, _each(evidence.feedback), evidence.sigma_m, statistics)[0], 1.0
+            self._learned(evidence.reward, each_rater(evidence.feedback), evidence.sigma_m, statistics)[0], 1.0
         )
 
     def explain(self, evidence: Evidence, statistics: Believed) -> Explanation:
         """Return what is learned, and why; sigma_h is tau."""
         r = evidence.reward
-        learned, weight, anchor, tau = self._learned(r, _each(evidence.feedback), evidence.sigma_m, statistics)
+        learned, weight, anchor, tau = self._learned(r, each_rater(evidence.feedback), evidence.sigma_m, statistics)
         return Explanation(LearningSignal(learned, 1.0), tau, 0.0 * r, weight, anchor, evidence.sigma_m + tau)
 
     def _learned(
@@ -126,9 +126,3 @@ class PooledDiscounting(Mitigation):
             xp.where(rated, b, u + 0.0 * b),
             p.tau,
         )
-
-
-def _each(feedback: Feedback) -> ByRater:
-    if feedback.by_rater is None:
-        raise _checks.InvalidValueError("feedback.by_rater", None, "each rater's ratings: this rule asks who said what")
-    return feedback.by_rater

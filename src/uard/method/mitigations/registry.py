@@ -11,11 +11,16 @@ from uard.method.mitigations.baselines import RatedReward, Raw, Screening
 from uard.method.mitigations.discounting import uard, uard_paper
 from uard.method.mitigations.pooled import PooledDiscounting
 from uard.method.mitigations.protocol import Mitigation
+from uard.method.mitigations.robust import ExcessDisagreement, RaterCap
 
 NAMED: dict[str, Callable[..., Mitigation]] = {
     "raw": Raw,
     "mean-of-annotations": RatedReward,
     "worst-of-annotations": partial(RatedReward, statistic="lowest"),
+    "median": partial(RaterCap, cap=False),
+    "min-proxy-mean": partial(RaterCap, statistic="mean"),
+    "min-proxy-median": RaterCap,
+    "excess": ExcessDisagreement,
     "lcb": partial(RatedReward, statistic="bound"),
     "screening": Screening,
     "pooled": PooledDiscounting,
