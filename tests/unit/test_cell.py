@@ -109,6 +109,7 @@ RATER = {
     "lapse": 0.2,
     "coverage": 0.9,
     "stars": 5,
+    "outliers": 0.05,
 }
 
 

@@ -1,7 +1,7 @@
 """Mitigations: what reward is learned from, how actions are scored, which score the backup follows."""
 
 from uard.method.feedback import ByRater, Feedback
-from uard.method.mitigations.baselines import RatedReward, Raw, Screening
+from uard.method.mitigations.baselines import RatedReward, Raw, Screening, TrueReward
 from uard.method.mitigations.discounting import RewardDiscounting, uard, uard_paper
 from uard.method.mitigations.panel_statistics import PanelStatistics
 from uard.method.mitigations.pooled import PooledDiscounting
@@ -26,6 +26,7 @@ __all__ = [
     "Raw",
     "RewardDiscounting",
     "Screening",
+    "TrueReward",
     "is_mitigation",
     "named",
     "uard",

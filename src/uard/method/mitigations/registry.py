@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 from uard import plugins
-from uard.method.mitigations.baselines import RatedReward, Raw, Screening
+from uard.method.mitigations.baselines import RatedReward, Raw, Screening, TrueReward
 from uard.method.mitigations.discounting import uard, uard_paper
 from uard.method.mitigations.pooled import PooledDiscounting
 from uard.method.mitigations.protocol import Mitigation
@@ -15,6 +15,7 @@ from uard.method.mitigations.robust import ExcessDisagreement, RaterCap
 
 NAMED: dict[str, Callable[..., Mitigation]] = {
     "raw": Raw,
+    "true-reward": TrueReward,
     "mean-of-annotations": RatedReward,
     "worst-of-annotations": partial(RatedReward, statistic="lowest"),
     "median": partial(RaterCap, cap=False),

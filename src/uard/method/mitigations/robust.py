@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from uard import _checks
 from uard.method import pooled, rater_statistics
@@ -74,6 +74,8 @@ class ExcessDisagreement(Mitigation):
     Attributes:
         k: How many tau are taken off, >= 0.
     """
+
+    refits_early: ClassVar[bool] = True
 
     k: float = 1.5
 
