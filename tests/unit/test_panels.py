@@ -279,6 +279,8 @@ def test_without_a_panel_nobody_rates():
         ("bias", (math.inf, None)),
         ("scale", (0.0, math.inf)),
         ("outliers", (-0.1, 1.5)),
+        ("veto_above", (math.nan, "goal")),
+        ("veto", (-1.0, math.inf)),
         ("noise", (-0.1, math.nan)),
         ("contested_noise", (-0.1, "some")),
         ("lapse", (-0.1, 1.5)),
@@ -372,3 +374,10 @@ def test_a_random_panel_has_a_name_on_the_command_line():
     for bad in ("random:", "random:-1", "random:x", "random:1.5"):
         with pytest.raises(InvalidValueError, match="panel"):
             as_panel(bad)
+
+
+def test_a_veto_is_said_of_what_is_worth_more():
+    law = Panel((Rater(), Rater(veto_above=5.0, veto=-3.0))).law(
+        np.array([4.0, 10.0]), np.array([-1.0, 10.0]), np.zeros(2, bool)
+    )
+    assert law.centre.tolist() == [[-1.0, -1.0], [10.0, -3.0]]

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from uard import _checks
-from uard.method.arrays import Array, Numbers, namespace
+from uard.method.arrays import Array, Numbers, namespace, where
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -53,6 +53,8 @@ class Rater:
         stars: Answers are rounded to so many levels, evenly spaced over the panel's range, >= 2; not rounded if left
             out.
         outliers: Chance that an answer's noise is six times as large, in [0, 1].
+        veto_above: Of steps whose true reward is higher, the rater's mean answer is ``veto``; of none if left out.
+        veto: See there; in reward units.
     """
 
     temptation: float = 0.0
@@ -64,6 +66,8 @@ class Rater:
     coverage: float = 1.0
     stars: int | None = None
     outliers: float = field(default=0.0, metadata=OMITTED_AT_DEFAULT)
+    veto_above: float | None = field(default=None, metadata=OMITTED_AT_DEFAULT)
+    veto: float = field(default=0.0, metadata=OMITTED_AT_DEFAULT)
 
     def __post_init__(self) -> None:
         """Check the parameters.
@@ -84,6 +88,11 @@ class Rater:
         if self.stars is not None:
             _checks.whole("stars", self.stars, low=2, high=1000)
         _checks.number("outliers", self.outliers, low=0, high=1)
+        if self.veto_above is not None:
+            _checks.number("veto_above", self.veto_above)
+        _checks.number("veto", self.veto)
+        if self.veto and self.veto_above is None:
+            raise _checks.InvalidValueError("veto", self.veto, "left out where veto_above is")
 
     def __str__(self) -> str:
         """Return the noise and what else is not the default, such as ``noise 0.1, temptation 0.6``."""
@@ -102,7 +111,8 @@ class Rater:
         """Return the rater's mean answer to steps of which proxy and true reward are given; in reward units."""
         # A rater who repeats the proxy repeats it to the bit.
         seen = proxy if self.temptation == 1 else true + self.temptation * (proxy - true)
-        return seen if self.scale == 1 and self.bias == 0 else self.scale * seen + self.bias
+        said = seen if self.scale == 1 and self.bias == 0 else self.scale * seen + self.bias
+        return said if self.veto_above is None else where(true > self.veto_above, self.veto + 0.0 * said, said)
 
 
 class Quirks(NamedTuple):
