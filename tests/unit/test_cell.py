@@ -113,6 +113,9 @@ RATER = {
     "lapse": 0.2,
     "coverage": 0.9,
     "stars": 5,
+    "outliers": 0.05,
+    "veto_above": 5.0,
+    "veto": -1.0,
 }
 
 
@@ -181,7 +184,9 @@ def test_every_field_is_tried_below():
 
 def test_the_key_depends_on_every_field():
     keys = {name: with_changed(FULL, name, new).key for name, new in CHANGED.items()}
-    raters = [FULL.with_(panel=Panel((Rater(), Rater(**{n: v})), -1.0, 10.0)).key for n, v in RATER.items()]
+    needs = {"veto": {"veto_above": 1.0}}
+    changed = [Rater(**{n: v}, **needs.get(n, {})) for n, v in RATER.items()]
+    raters = [FULL.with_(panel=Panel((Rater(), other), -1.0, 10.0)).key for other in changed]
     assert len({FULL.key, *keys.values(), *raters}) == len(CHANGED) + len(RATER) + 1
 
 

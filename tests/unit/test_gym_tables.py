@@ -136,6 +136,6 @@ def test_making_and_diagnosing_grids_needs_no_jax():
         "from uard.envs.gym import IDS; from uard.envs.names import ENVIRONMENTS; "
         "envs = [gymnasium.make(i, panel='main') for i, n in IDS.items() if ENVIRONMENTS[n].kind != 'simulator']; "
         "[(env.reset(seed=0), env.step(1)) for env in envs]; "
-        "assert len(envs) == 18; assert not {'jax', 'torch', 'mujoco'} & set(sys.modules)"
+        "assert len(envs) == 19; assert not {'jax', 'torch', 'mujoco'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=60)

@@ -9,6 +9,7 @@ from uard import Evidence, Feedback, LearningSignal, Mitigation, ReliabilityFilt
 from uard._checks import InvalidValueError, UnknownNameError
 from uard.method.mitigations import (
     NAMED,
+    ByRater,
     PanelStatistics,
     RatedReward,
     Raw,
@@ -38,6 +39,11 @@ TABLE = Feedback(
     sd=np.array([0.1, 0.2, SIGMA_H, 0.0]),
     proxy=np.array([1.0, 0.5, 4.0, -0.1]),
     raters=np.full(4, 3.0),
+    by_rater=ByRater(
+        count=np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [3.0, 3.0, 3.0], [10.0, 9.0, 8.0]]),
+        mean=np.array([[0.1, 0.1, 0.2], [-0.2, 0.1, -0.5], [-1.0, 2.0, 1.0], [0.5, 0.4, 0.6]]),
+        m2=np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0], [0.3, 0.1, 0.2], [0.8, 0.5, 0.1]]),
+    ),
 )
 SIGMA_M = np.array([0.0, 0.4, 1.0, 2.0])
 MU = np.array([1.0, -1.0, 0.0, 4.0])
@@ -186,7 +192,10 @@ def test_every_array_library_gives_the_same(backend, name):
 @pytest.mark.parametrize("name", [*NAMED, *MORE])
 def test_what_was_never_rated_means_nothing(name):
     mitigation = (NAMED | MORE)[name]()
-    poisoned = Feedback(*(np.where(TABLE.count > 0, x, x if x is TABLE.count else np.nan) for x in TABLE[:6]))
+    known = TABLE.count > 0
+    poisoned = TABLE.map(lambda x: np.where(known if x.ndim == 1 else known[:, None], x, np.nan))
+    each = poisoned.by_rater._replace(count=TABLE.by_rater.count)
+    poisoned = poisoned._replace(count=TABLE.count, by_rater=each)
     clean, dirty = (learned(mitigation, t._replace(proxy=TABLE.proxy)) for t in (TABLE, poisoned))
     np.testing.assert_array_equal(clean.reward, dirty.reward)
     np.testing.assert_array_equal(clean.sample_weight, dirty.sample_weight)

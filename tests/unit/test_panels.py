@@ -28,6 +28,7 @@ from uard.ratings.panels import (
     answers,
     as_panel,
     draw,
+    random_panel,
 )
 
 GRID = TrapGrid(size=6)
@@ -276,7 +277,10 @@ def test_without_a_panel_nobody_rates():
     [
         ("temptation", (-0.1, 1.1, math.nan, "much")),
         ("bias", (math.inf, None)),
-        ("scale", (0.0, -1.0)),
+        ("scale", (0.0, math.inf)),
+        ("outliers", (-0.1, 1.5)),
+        ("veto_above", (math.nan, "goal")),
+        ("veto", (-1.0, math.inf)),
         ("noise", (-0.1, math.nan)),
         ("contested_noise", (-0.1, "some")),
         ("lapse", (-0.1, 1.5)),
@@ -332,3 +336,48 @@ def test_names():
 def test_an_end_of_the_range_alone_is_checked_too(ends):
     with pytest.raises(InvalidValueError, match=f"^{next(iter(ends))} = "):
         Panel((Rater(),), **ends)
+
+
+def test_outliers_are_six_times_as_far_and_as_frequent_as_said():
+    plain, heavy = (Panel((Rater(noise=0.5, outliers=x, coverage=1.0),) * 2) for x in (0.0, 0.25))
+    shape = (20_000,)
+    far = []
+    for panel in (plain, heavy):
+        law = panel.law(np.zeros(shape), np.zeros(shape), np.zeros(shape, bool))
+        far.append(np.abs(draw(law, np.random.default_rng(0))))
+    assert far[0].max() < 3.0  # six deviations
+    beyond = (far[1] > 3.0).mean()  # one deviation of an outlier
+    assert beyond == pytest.approx(0.25 * 0.3173, abs=0.006)  # four standard errors
+
+
+def test_a_contrary_rater_says_the_opposite():
+    assert Rater(scale=-1.0).centre(proxy=4.0, true=10.0) == -10.0
+
+
+def test_random_panels_are_what_they_are_said_to_be():
+    panels = [random_panel(seed) for seed in range(600)]
+    sizes = np.bincount([len(p.raters) for p in panels], minlength=8)[1:]
+    assert sizes.min() > 60  # 86 on average, nine deviations of four
+    for panel in panels:
+        useless = sum(r.temptation == 1 or r.lapse == 1 for r in panel.raters)
+        assert panel.raters[0].temptation == 0
+        assert panel.raters[0].lapse == 0
+        assert useless == 0 or 2 * useless < len(panel.raters)
+    others = [r for p in panels for r in p.raters[1:]]
+    assert np.mean([0 < r.temptation < 1 for r in others]) == pytest.approx(1 / 6, abs=0.04)
+    assert all(0.1 <= r.noise <= 2.5 for r in others)
+    assert np.mean([p.raters[0].stars == 7 for p in panels]) == pytest.approx(0.25, abs=0.07)
+
+
+def test_a_random_panel_has_a_name_on_the_command_line():
+    assert as_panel("random:12") == random_panel(12) != random_panel(13)
+    for bad in ("random:", "random:-1", "random:x", "random:1.5"):
+        with pytest.raises(InvalidValueError, match="panel"):
+            as_panel(bad)
+
+
+def test_a_veto_is_said_of_what_is_worth_more():
+    law = Panel((Rater(), Rater(veto_above=5.0, veto=-3.0))).law(
+        np.array([4.0, 10.0]), np.array([-1.0, 10.0]), np.zeros(2, bool)
+    )
+    assert law.centre.tolist() == [[-1.0, -1.0], [10.0, -3.0]]

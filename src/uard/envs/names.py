@@ -13,6 +13,7 @@ from uard.envs.base import Environment
 from uard.envs.classic.specs import Acrobot, CartPole
 from uard.envs.grids.gaming import AbsentSupervisor, BoatRace, TomatoWatering
 from uard.envs.grids.learned_reward import LearnedRewardGrid
+from uard.envs.grids.random_tasks import RandomMDP
 from uard.envs.grids.trapgrid import PAPER_TRAPS, TrapGrid
 from uard.envs.locomotion.inverted_pendulum import InvertedPendulum
 from uard.envs.locomotion.locomotion import Locomotion
@@ -33,6 +34,7 @@ KINDS: dict[str, tuple[type[Environment], dict[str, Any]]] = {
         for suffix, twin in TWINS.items()
     },
     "LearnedRewardGrid": (LearnedRewardGrid, {}),
+    "RandomMDP": (RandomMDP, {}),
     **{
         f"{robot.capitalize()}-{region.capitalize()}{suffix}": (Locomotion, {"robot": robot, "region": region, **twin})
         for robot in ("hopper", "walker2d")

@@ -88,6 +88,9 @@ class Cell:
             self._put(name, _part(name, getattr(self, name)))
         self._check_numbers()
         trainer = registry.trainer(self.agent, self.environment)
+        if self.mitigation.reads_truth and not trainer.knows_truth:
+            allowed = "one that reads no true reward, but for a tabular agent"
+            raise _checks.InvalidValueError("mitigation", self.mitigation, allowed)
         self._settle_budget(trainer)
         self._settle_feedback(trainer)
         if not self.mitigation.reads_feedback:

@@ -17,18 +17,20 @@ How a panel rates a step is a law, and an answer is drawn from it:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from uard import _checks
-from uard.method.arrays import Array, Numbers, namespace
+from uard.method.arrays import Array, Numbers, namespace, where
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 A_PANEL = "a tuple of one Rater or more"
+OUTLIER = 6.0  # times the usual noise
+OMITTED_AT_DEFAULT = {"omitted_at_default": True}  # of a field that came later: see uard.lab.config.plain
 UNIFORMS = 3  # uniform numbers that an answer needs of a rater who lapses, skips steps or counts in stars
 
 
@@ -43,13 +45,16 @@ class Rater:
     Attributes:
         temptation: How far the rater is drawn from the truth towards the proxy, in [0, 1]; 1 repeats the proxy.
         bias: Added to every rating, in reward units.
-        scale: Every rating is multiplied by this, > 0.
+        scale: Every rating is multiplied by this, not 0; a contrary rater's is negative.
         noise: Standard deviation of normal noise, in reward units, >= 0.
         contested_noise: The same on contested steps; ``noise`` if left out.
         lapse: Chance that an answer does not depend on the step: uniform over the panel's range.
         coverage: Share of the steps put to the panel that the rater answers, in (0, 1].
         stars: Answers are rounded to so many levels, evenly spaced over the panel's range, >= 2; not rounded if left
             out.
+        outliers: Chance that an answer's noise is six times as large, in [0, 1].
+        veto_above: Of steps whose true reward is higher, the rater's mean answer is ``veto``; of none if left out.
+        veto: See there; in reward units.
     """
 
     temptation: float = 0.0
@@ -60,6 +65,9 @@ class Rater:
     lapse: float = 0.0
     coverage: float = 1.0
     stars: int | None = None
+    outliers: float = field(default=0.0, metadata=OMITTED_AT_DEFAULT)
+    veto_above: float | None = field(default=None, metadata=OMITTED_AT_DEFAULT)
+    veto: float = field(default=0.0, metadata=OMITTED_AT_DEFAULT)
 
     def __post_init__(self) -> None:
         """Check the parameters.
@@ -69,7 +77,9 @@ class Rater:
         """
         _checks.number("temptation", self.temptation, low=0, high=1)
         _checks.number("bias", self.bias)
-        _checks.number("scale", self.scale, low=0, open_low=True)
+        _checks.number("scale", self.scale)
+        if self.scale == 0:
+            raise _checks.InvalidValueError("scale", self.scale, "another number than 0")
         _checks.number("noise", self.noise, low=0)
         if self.contested_noise is not None:
             _checks.number("contested_noise", self.contested_noise, low=0)
@@ -77,6 +87,12 @@ class Rater:
         _checks.number("coverage", self.coverage, low=0, high=1, open_low=True)
         if self.stars is not None:
             _checks.whole("stars", self.stars, low=2, high=1000)
+        _checks.number("outliers", self.outliers, low=0, high=1)
+        if self.veto_above is not None:
+            _checks.number("veto_above", self.veto_above)
+        _checks.number("veto", self.veto)
+        if self.veto and self.veto_above is None:
+            raise _checks.InvalidValueError("veto", self.veto, "left out where veto_above is")
 
     def __str__(self) -> str:
         """Return the noise and what else is not the default, such as ``noise 0.1, temptation 0.6``."""
@@ -88,14 +104,15 @@ class Rater:
 
     @property
     def plain(self) -> bool:
-        """Whether every answer is normal: no lapses, nothing skipped, no stars."""
-        return self.lapse == 0 and self.coverage == 1 and self.stars is None
+        """Whether every answer is normal: no lapses, nothing skipped, no stars, no outliers."""
+        return self.lapse == 0 and self.coverage == 1 and self.stars is None and self.outliers == 0
 
     def centre(self, proxy: Numbers, true: Numbers) -> Array:
         """Return the rater's mean answer to steps of which proxy and true reward are given; in reward units."""
         # A rater who repeats the proxy repeats it to the bit.
         seen = proxy if self.temptation == 1 else true + self.temptation * (proxy - true)
-        return seen if self.scale == 1 and self.bias == 0 else self.scale * seen + self.bias
+        said = seen if self.scale == 1 and self.bias == 0 else self.scale * seen + self.bias
+        return said if self.veto_above is None else where(true > self.veto_above, self.veto + 0.0 * said, said)
 
 
 class Quirks(NamedTuple):
@@ -107,6 +124,7 @@ class Quirks(NamedTuple):
         step: Width of a star, in reward units; 0 for a rater who does not count in stars.
         low: Lower end of the range of answers, in reward units.
         high: Upper end.
+        outliers: Chance of an outlier.
     """
 
     lapse: Float[Array, " K"]
@@ -114,6 +132,7 @@ class Quirks(NamedTuple):
     step: Float[Array, " K"]
     low: Float[Array, ""]
     high: Float[Array, ""]
+    outliers: Float[Array, " K"]
 
 
 class RatingLaw(NamedTuple):
@@ -218,7 +237,8 @@ class Panel:
         low, high = self.low or 0.0, self.high or 0.0
         width = [0.0 if r.stars is None else (high - low) / (r.stars - 1) for r in self.raters]
         lapse, coverage = [r.lapse for r in self.raters], [r.coverage for r in self.raters]
-        return Quirks._make(np.array(x, np.float32) for x in (lapse, coverage, width, low, high))
+        outliers = [r.outliers for r in self.raters]
+        return Quirks._make(np.array(x, np.float32) for x in (lapse, coverage, width, low, high, outliers))
 
 
 def _noise(
@@ -245,11 +265,13 @@ def answers(
         normal: Standard normal numbers.
         uniform: Numbers in [0, 1), ``UNIFORMS`` = 3 for each answer; needed only if the law has quirks.
     """
-    ratings = law.centre + law.deviation * normal
     if law.quirks is None:
-        return ratings, None
+        return law.centre + law.deviation * normal, None
     assert uniform is not None
-    xp, q = namespace(ratings, uniform), law.quirks
+    xp, q = namespace(law.centre, normal, uniform), law.quirks
+    # One number decides whether an answer is an outlier, or what a lapse says: no answer is both.
+    noise = xp.where(uniform[..., 1] < q.outliers, OUTLIER * law.deviation, law.deviation)
+    ratings = law.centre + noise * normal
     ratings = xp.where(uniform[..., 0] < q.lapse, q.low + (q.high - q.low) * uniform[..., 1], ratings)
     width = xp.where(q.step > 0, q.step, xp.ones_like(q.step))
     starred = xp.clip(q.low + width * xp.round((ratings - q.low) / width), q.low, q.high)
@@ -287,14 +309,93 @@ SINGLE = Panel((Rater(),))
 PANELS: dict[str, Panel] = {"main": MAIN, "appendix": APPENDIX, "colluding": COLLUDING, "single": SINGLE}
 
 
+RANGE = (-12.0, 12.0)  # of random panels' answers in stars and at random, in units of their scale
+RANDOM = "random:"  # before the seed in the name of a random panel
+
+
+def random_panel(seed: int, scale: float = 1.0) -> Panel:
+    """Draw a panel.
+
+    One to seven raters, the first of them truthful. Of the others one in two is truthful, one in six is drawn 20 to
+    80 % of the way towards the observed reward, one in six repeats it, one in six answers at random; those who repeat
+    or answer at random are fewer than half of all. Every rater has a bias (normal, sd 0.3), noise (0.1 to 2.5,
+    log-uniform) and a coverage of 1, 1, 0.5 or 0.2. In one panel of three noise is six times as large in 5 % of the
+    answers; in one of four all answer in seven stars.
+
+    Examples:
+        >>> print(random_panel(9))
+        2 raters: noise 1.58814, bias -0.35704, coverage 0.2; noise 0.526578, bias 0.237539
+
+    Args:
+        seed: A whole number >= 0. Even ones below 1000 are for development, all others for what is reported.
+        scale: Reward units in which biases, noise and ranges are measured, > 0; 1 is that of a grid whose step is -0.1
+            and whose goal is 10.
+
+    Raises:
+        InvalidValueError: for a seed or a scale out of range.
+    """
+    _checks.whole("seed", seed, low=0)
+    _checks.number("scale", scale, low=0, open_low=True)
+    random = np.random.default_rng([seed, 1])
+    raters = int(random.integers(1, 8))
+    stars = 7 if random.random() < 0.25 else None
+    heavy = 0.05 if random.random() < 1 / 3 else 0.0
+    useless = 0
+    members: list[Rater] = []
+    for k in range(raters):
+        kind = random.choice(["truthful", "tempted", "repeating", "spamming"], p=[1 / 2, 1 / 6, 1 / 6, 1 / 6])
+        if k == 0 or (kind in ("repeating", "spamming") and 2 * (useless + 1) >= raters):
+            kind = "truthful"
+        useless += kind in ("repeating", "spamming")
+        members.append(_rater(kind, random, scale, stars, heavy))
+    return Panel(tuple(members), RANGE[0] * scale, RANGE[1] * scale)
+
+
+def _rater(kind: str, random: np.random.Generator, scale: float, stars: int | None, heavy: float) -> Rater:
+    bias = 0.3 * random.normal()
+    noise = 0.1 * 25 ** random.random()
+    share = random.uniform(0.2, 0.8)
+    coverage = float(random.choice([1.0, 1.0, 0.5, 0.2]))
+    if kind == "spamming":
+        return Rater(lapse=1.0, coverage=coverage, stars=stars)
+    return Rater(
+        temptation={"truthful": 0.0, "tempted": share, "repeating": 1.0}[kind],
+        bias=0.0 if kind == "repeating" else bias * scale,
+        noise=noise * scale,
+        coverage=coverage,
+        stars=stars,
+        outliers=heavy,
+    )
+
+
+def random_share(seed: int) -> float:
+    """Return which share of the steps a random panel's raters are asked about: 1, 1, 0.3, 0.1 or 0.03.
+
+    Examples:
+        >>> random_share(9)
+        1.0
+    """
+    return float(np.random.default_rng([seed, 2]).choice([1.0, 1.0, 0.3, 0.1, 0.03]))
+
+
 def as_panel(panel: str | Panel) -> Panel:
-    """Return the panel of a name, or the panel itself.
+    """Return the panel of a name, or the panel itself; ``random:7`` is ``random_panel(7)``.
 
     Examples:
         >>> as_panel("single") is SINGLE and as_panel(SINGLE) is SINGLE
         True
+        >>> as_panel("random:7") == random_panel(7)
+        True
 
     Raises:
         UnknownNameError: with the nearest name.
+        InvalidValueError: a random panel whose seed is no whole number.
     """
-    return panel if isinstance(panel, Panel) else PANELS[_checks.choose("panel", panel, PANELS)]
+    if isinstance(panel, Panel):
+        return panel
+    if str(panel).startswith(RANDOM):
+        seed = panel.removeprefix(RANDOM)
+        if not (seed.isascii() and seed.isdecimal() and len(seed) < 20):
+            raise _checks.InvalidValueError("panel", panel, f"{RANDOM} and a whole number of at most 19 digits")
+        return random_panel(int(seed))
+    return PANELS[_checks.choose("panel", panel, [*PANELS, f"{RANDOM}SEED"])]

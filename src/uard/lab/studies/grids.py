@@ -11,7 +11,7 @@ from uard.lab.cell import Cell
 from uard.lab.studies.common import PANELS, RAW, SIZES, WALKER
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import Mitigation, named
-from uard.ratings.panels import as_panel
+from uard.ratings.panels import Panel, Rater, as_panel
 
 COMPARED = (
     "raw",
@@ -94,6 +94,7 @@ def budgets() -> tuple[Row, ...]:
     )
 
 
+DISSENT = ("raw", "mean-of-annotations", "median", "worst-of-annotations", "lcb", "uard", "pooled")
 UNSEEN = (
     TrapGrid(size=5, traps=((2, 2),)),
     TrapGrid(size=7, traps=((0, 2), (2, 0), (3, 3)), trap_reward=2.0),
@@ -187,6 +188,29 @@ def sources() -> tuple[Row, ...]:
     )
 
 
+def dissent() -> tuple[Row, ...]:
+    """One rater of three or five says too little of the goal: who takes that for the truth?
+
+    Of three raters nobody can know who is right. Of five, a rule may overrule one who is alone and no more precise than
+    the others: both ends of that choice are here.
+    """
+    compared: dict[str, Mitigation] = {name: named(name) for name in DISSENT}
+    compared["pooled, one veto overruled"] = named("pooled", vetoes=1)
+    return tuple(
+        row(
+            Cell(
+                paper_grid(6), mitigation, panel=Panel((*(Rater(),) * (raters - 1), Rater(veto_above=5.0, veto=says)))
+            ),
+            mitigation=name,
+            raters=raters,
+            dissenter_says=says,
+        )
+        for raters in (3, 5)
+        for says in (5.0, 0.0, -1.0, -3.0)
+        for name, mitigation in compared.items()
+    )
+
+
 def control() -> tuple[Row, ...]:
     """A uniformly random walker on every grid: by trap visits alone it beats the paper's method."""
     return tuple(
@@ -206,5 +230,6 @@ def studies() -> tuple[Study, ...]:
         Study(
             "sources", "A learned reward that extrapolates: which source of doubt does the work", "H8, K10", sources()
         ),
+        Study("dissent", "One rater who denies the goal", "vetoes", dissent()),
         Study("control", "A random walker", "should-fail control", control()),
     )

@@ -40,6 +40,7 @@ class Trainer(ABC):
         rating_models: How it can know of ratings, by the names of the command line, the default first. ``table``,
             which is None: running means per state-action.
         snapshots: Whether it can keep tables along the way.
+        knows_truth: Whether it can train an oracle, whose mitigation reads the true reward.
         queries: How the steps that are rated may be chosen.
     """
 
@@ -51,6 +52,7 @@ class Trainer(ABC):
     budget: ClassVar[Literal["episodes", "steps"]] = "episodes"
     rating_models: ClassVar[Mapping[str, RatingModel | TransitionModel | None]]
     snapshots: ClassVar[bool] = False
+    knows_truth: ClassVar[bool] = False
     queries: ClassVar[tuple[str, ...]] = ("random",)
 
     def serves(self, agent: Any, environment: Any) -> bool:

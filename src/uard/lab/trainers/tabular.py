@@ -31,6 +31,7 @@ class Tabular(Trainer):
     at_once = 64  # about half a second of work
     rating_models = {"table": None}  # noqa: RUF012 (read only)
     snapshots = True
+    knows_truth = True
 
     def place(self, environment: Any) -> Hashable:
         """Return the class and the number of states: all else are numbers in tables."""
@@ -49,11 +50,10 @@ class Tabular(Trainer):
         for cell, seed in batch:
             if cell not in tables:
                 environment = cell.environment
-                tables[cell] = (
-                    environment.task(),
-                    environment.truth(),
-                    environment.rating_law(cell.panel, cell.noise),
-                )
+                task, truth = environment.task(), environment.truth()
+                if cell.mitigation.reads_truth:
+                    task = task._replace(reward=truth.reward)
+                tables[cell] = task, truth, environment.rating_law(cell.panel, cell.noise)
             task, truth, law = tables[cell]
             runs.append(tabular.make_run(task, law, truth, cell.agent, cell.mitigation, seed, cell.rated))
         first = batch[0][0]

@@ -19,7 +19,7 @@ def losses(results: StudyResults) -> list[str]:
         _beaten(results, study, shown)
         for study, shown in (("matrix", ("size", "trap", "panel", "noise")), ("budgets", ("panel", "noise", "rated")))
     )
-    return [_colluding(results), _missed(results), _learned(results), *beaten, *_rankings(results)]
+    return [_colluding(results), _missed(results), _denied(results), _learned(results), *beaten, *_rankings(results)]
 
 
 def _colluding(results: StudyResults) -> str:
@@ -64,6 +64,20 @@ def _missed(results: StudyResults) -> str:
     return (
         f"Of the {len(honest)} settings with honest raters and noise up to sd 1.2, uard misses 0.2 visits (0.15 without "
         f"noise) or 98 % goals in {len(missed)}{named}."
+    )
+
+
+def _denied(results: StudyResults) -> str:
+    """One rater of several who denies the goal."""
+    lost = [
+        (r, success)
+        for r in results.studies["dissent"].where(mitigation="uard")
+        if (success := results.of(r.cell, "success_rate")).mean < 0.9
+    ]
+    named = "; ".join(f"1 of {r['raters']} says {r['dissenter_says']:g}: {brief(success)}" for r, success in lost)
+    return (
+        f"One rater who denies the goal takes it from uard in {len(lost)} of "
+        f"{len(list(results.studies['dissent'].where(mitigation='uard')))} settings (share of episodes that reach it{': ' if named else ''}{named})."
     )
 
 
@@ -125,7 +139,7 @@ def _name(r: Row) -> str:
 def tables(results: StudyResults) -> list[Table]:
     """Return all tables."""
     matrices = (_matrix(results, metric) for metric in ("true_return", "hacks", "success_rate"))
-    return [*matrices, _twins(results), _calibration(results), _sources(results)]
+    return [*matrices, _twins(results), _dissent(results), _calibration(results), _sources(results)]
 
 
 def pictures(results: StudyResults) -> list[tuple[str, str, str]]:
@@ -180,6 +194,27 @@ def _twins(results: StudyResults) -> Table:
         tuple(rows),
         3,
         "The erratic rater stays erratic at the bonus. UARD as printed gives up nearly everything.",
+    )
+
+
+def _dissent(results: StudyResults) -> Table:
+    study = results.studies["dissent"]
+    says = list(dict.fromkeys(r["dissenter_says"] for r in study.rows))
+    rows = []
+    for raters in (3, 5):
+        for name in dict.fromkeys(r["mitigation"] for r in study.rows):
+            found = [
+                results.get("dissent", "success_rate", mitigation=name, raters=raters, dissenter_says=x) for x in says
+            ]
+            rows.append((raters, name, *map(brief, found)))
+    return Table(
+        "One rater denies the goal: share of episodes that reach it, 6x6",
+        ("raters", "mitigation", *(f"says {x:g}" for x in says)),
+        tuple(rows),
+        2,
+        "The others tell the truth with noise of sd 0.1, as this one does elsewhere; the goal pays 10 and is worth it. "
+        "Of three nobody can know who is right. Of five, `pooled` may overrule a lone low rater who is no more precise "
+        "than the others (vetoes=1); it then learns no more from one expert against a crowd.",
     )
 
 

@@ -35,6 +35,25 @@ class Raw(Mitigation):
         return LearningSignal(evidence.reward, 1.0)
 
 
+@dataclass(frozen=True)
+class TrueReward(Mitigation):
+    """Learn from the true reward: the oracle, of which regret is measured. Tabular training only.
+
+    Examples:
+        >>> from uard.envs.grids.trapgrid import TrapGrid
+        >>> from uard.lab.cell import Cell
+        >>> Cell(TrapGrid(), TrueReward()).mitigation.reads_truth
+        True
+    """
+
+    reads_feedback: ClassVar[bool] = False
+    reads_truth: ClassVar[bool] = True
+
+    def signal(self, evidence: Evidence, statistics: Any) -> LearningSignal:
+        """Return the reward, which a trainer has replaced by the true one."""
+        return LearningSignal(evidence.reward, 1.0)
+
+
 Statistic = Literal["mean", "lowest", "bound"]
 
 

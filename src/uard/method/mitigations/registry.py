@@ -8,16 +8,24 @@ from functools import partial
 from typing import Any
 
 from uard import _checks, plugins
-from uard.method.mitigations.baselines import RatedReward, Raw, Screening
+from uard.method.mitigations.baselines import RatedReward, Raw, Screening, TrueReward
 from uard.method.mitigations.discounting import uard, uard_paper
+from uard.method.mitigations.pooled import PooledDiscounting
 from uard.method.mitigations.protocol import Mitigation
+from uard.method.mitigations.robust import ExcessDisagreement, RaterCap
 
 NAMED: dict[str, Callable[..., Mitigation]] = {
     "raw": Raw,
+    "true-reward": TrueReward,
     "mean-of-annotations": RatedReward,
     "worst-of-annotations": partial(RatedReward, statistic="lowest"),
+    "median": partial(RaterCap, cap=False),
+    "min-proxy-mean": partial(RaterCap, statistic="mean"),
+    "min-proxy-median": RaterCap,
+    "excess": ExcessDisagreement,
     "lcb": partial(RatedReward, statistic="bound"),
     "screening": Screening,
+    "pooled": PooledDiscounting,
     "uard": uard,
     "uard-paper": uard_paper,
     "uard-consistent": partial(uard_paper, backup="consistent"),

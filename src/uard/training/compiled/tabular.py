@@ -25,6 +25,7 @@ from uard.training.episode_log import LOG
 from uard.training.tracing import traceable
 
 CHUNK = 512  # steps whose random numbers are drawn together; the panel's statistics are measured once a chunk
+EARLY = np.isin(np.arange(CHUNK), [0, *(2**i for i in range(CHUNK.bit_length()))])  # when it is measured in the first
 ROOM = 64  # a program has room for this many runs, or a multiple
 
 
@@ -255,13 +256,21 @@ def train_one(run: Run, program: Program) -> TrainedTables:
             steps=c.steps + active.astype(jnp.int32),
         ), None
 
-    def chunk(loop: tuple[_Carry, Array, Array, Array]) -> tuple[_Carry, Array, Array, Array]:
+    def refitting_step(c: _Carry, now: tuple[Array, _Draws]) -> tuple[_Carry, None]:
+        fits, draws = now
+        statistics = lax.cond(fits, panel_statistics, lambda rows: c.statistics, c.rows)
+        return one_step(c._replace(statistics=statistics), draws)
+
+    def chunk(loop: tuple[_Carry, Array, Array, Array], refits: bool = False) -> tuple[_Carry, Array, Array, Array]:
         c, number, q_kept, rows_kept = loop
         draws = _drawn(run, number, actions, raters if asks_raters else None)
-        if asks_raters:
-            c = c._replace(statistics=panel_statistics(c.rows))
         slot = c.episode * program.snapshots // program.episodes
-        c, _ = lax.scan(one_step, c, draws)
+        if refits:
+            c, _ = lax.scan(refitting_step, c, (jnp.asarray(EARLY), draws))
+        else:
+            if asks_raters:
+                c = c._replace(statistics=panel_statistics(c.rows))
+            c, _ = lax.scan(one_step, c, draws)
         if program.snapshots:
             # A chunk can pass over several slots, so all that are left are filled; the next chunk overwrites them.
             later = (jnp.arange(program.snapshots) >= slot)[:, None, None, None]
@@ -285,9 +294,10 @@ def train_one(run: Run, program: Program) -> TrainedTables:
         steps=jnp.int32(0),
     )
     kept = jnp.zeros((program.snapshots, *q.shape)), jnp.zeros((program.snapshots, *rows.shape))
-    c, _, q_kept, rows_kept = lax.while_loop(
-        lambda loop: loop[0].episode < program.episodes, chunk, (start, jnp.uint32(1), *kept)
-    )
+    loop = start, jnp.uint32(1), *kept
+    if mitigation.refits_early and asks_raters:
+        loop = chunk(loop, refits=True)
+    c, _, q_kept, rows_kept = lax.while_loop(lambda loop: loop[0].episode < program.episodes, chunk, loop)
     log = c.log[:-1]  # what came after the last episode was put into the last row
     return TrainedTables(log, c.steps, c.q, from_rows(c.rows), q_kept, from_rows(rows_kept))
 

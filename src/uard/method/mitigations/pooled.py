@@ -1,0 +1,129 @@
+"""Reward discounting that knows who said what: the pooled rule of ``uard.method.pooled``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
+
+from uard import _checks
+from uard.method import pooled
+from uard.method.arrays import Array, namespace
+from uard.method.feedback import ByRater, Feedback
+from uard.method.mitigations.protocol import Evidence, Explanation, LearningSignal, Mitigation
+from uard.method.mitigations.robust import each_rater, fit_raters
+from uard.method.rater_statistics import RaterStatistics, masked_median
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+
+class Believed(NamedTuple):
+    """Statistics of a panel, and the median of what is learned with them.
+
+    Attributes:
+        raters: See ``RaterStatistics``.
+        usual: Median reward that is learned over rated state-actions, in reward units; 0 before any rating.
+    """
+
+    raters: RaterStatistics
+    usual: Float[Array, ""]
+
+
+@dataclass(frozen=True)
+class PooledDiscounting(Mitigation):
+    """Believe a reward as far as it is likelier that all raters are centred at it than that they are not.
+
+    What is learned is b + w (r - b) - risk sqrt(w (1 - w)) |r - b|, with b = pooled mean - contest tau - caution
+    standard errors. Where nobody has rated: min(r, u + unrated_weight (r - u)) - risk sigma_m, with u the usual reward.
+
+    Examples:
+        >>> import numpy as np
+        >>> from uard.ratings.aggregate import aggregate
+        >>> reward = np.array([4.0] + 9 * [-0.1])
+        >>> ratings = np.array([[-1.0, 2.0, 1.0]] + 9 * [[-0.1, -0.1, -0.1]])
+        >>> feedback, mitigation = aggregate(ratings, reward), PooledDiscounting()
+        >>> statistics = mitigation.fit(feedback, feedback.count > 0)
+        >>> why = mitigation.explain(Evidence(reward, np.zeros(10), feedback), statistics)
+        >>> why.weight[:2].round(2).tolist()
+        [0.0, 1.0]
+
+    Attributes:
+        lies: Prior share of rewards that lie, in (0, 1).
+        slack: By which share of an unusual reward a rater may be off without a reason, >= 0.
+        contest: How many tau the anchor lies below the pooled mean, >= 0.
+        caution: How many standard errors of the pooled mean it lies below that, >= 0.
+        risk: Premium >= 0 for not knowing which hypothesis holds, in posterior standard deviations.
+        unrated_weight: How far an extraordinary reward is believed that nobody has rated, in [0, 1].
+        vetoes: How many lone low dissenters may be overruled, see ``uard.method.pooled.overruled``; >= 0.
+    """
+
+    discounts: ClassVar[bool] = True
+    refits_early: ClassVar[bool] = True
+
+    lies: float = 0.2
+    slack: float = 0.1
+    contest: float = 1.0
+    caution: float = 0.5
+    risk: float = 1.0
+    unrated_weight: float = 0.05
+    vetoes: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
+        _checks.number("lies", self.lies, low=0, high=1, open_low=True)
+        if self.lies == 1:
+            raise _checks.InvalidValueError("lies", self.lies, "less than 1: a reward that always lies teaches nothing")
+        for name in ("slack", "contest", "caution", "risk"):
+            _checks.number(name, getattr(self, name), low=0)
+        _checks.number("unrated_weight", self.unrated_weight, low=0, high=1)
+        _checks.whole("vetoes", self.vetoes, high=30)
+
+    def fit(self, feedback: Feedback, rated: Bool[Array, "*batch"]) -> Believed:
+        """Measure the raters, and what is usual."""
+        raters = fit_raters(feedback, rated)
+        r = feedback.proxy
+        learned = self._learned(r, each_rater(feedback), 0.0 * r, Believed(raters, 0.0 * raters.scale))[0]
+        xp = namespace(learned)
+        return Believed(raters, masked_median(xp.reshape(learned, (-1,)), xp.reshape(rated, (-1,))))
+
+    def signal(self, evidence: Evidence, statistics: Believed) -> LearningSignal:
+        """Return what is learned."""
+        return LearningSignal(
+            self._learned(evidence.reward, each_rater(evidence.feedback), evidence.sigma_m, statistics)[0], 1.0
+        )
+
+    def explain(self, evidence: Evidence, statistics: Believed) -> Explanation:
+        """Return what is learned, and why; sigma_h is tau."""
+        r = evidence.reward
+        learned, weight, anchor, tau = self._learned(r, each_rater(evidence.feedback), evidence.sigma_m, statistics)
+        return Explanation(LearningSignal(learned, 1.0), tau, 0.0 * r, weight, anchor, evidence.sigma_m + tau)
+
+    def _learned(
+        self, r: Float[Array, "*batch"], each: ByRater, doubt: Float[Array, "*batch"], statistics: Believed
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return what is learned, the weight, the anchor and tau."""
+        xp, raters = namespace(each.mean), statistics.raters
+        here = (each.count > 0) & (raters.heard > 0)
+        said, variance = each.mean - raters.bias, pooled.errors(r, each, raters, self.slack)
+        if self.vetoes:
+            here = pooled.overruled(said, here, variance, raters.noise, self.vetoes)
+        p = pooled.pool(r, said, here, variance, raters.span)
+        half = xp.exp(0.5 * xp.clip(p.log_odds, -pooled.LARGEST_ODDS, pooled.LARGEST_ODDS))
+        odds = self.lies / (1.0 - self.lies) * half * half
+        w = 1.0 / (1.0 + odds)
+        deviation = (self.lies / (1.0 - self.lies)) ** 0.5 * half * w  # sqrt(w (1 - w)), with a finite gradient
+        b = p.centre - self.contest * p.tau - self.caution * p.error
+        learned = b + w * (r - b) - self.risk * deviation * abs(r - b)
+        u = statistics.usual
+        unrated = xp.minimum(r, u + self.unrated_weight * (r - u)) - self.risk * doubt
+        rated = p.heard > 0
+        return (
+            xp.where(rated, learned, unrated),
+            xp.where(rated, w, 0.0 * w + self.unrated_weight),
+            xp.where(rated, b, u + 0.0 * b),
+            p.tau,
+        )

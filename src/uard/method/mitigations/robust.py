@@ -1,0 +1,143 @@
+"""Simple rules that know who said what: the median of the raters, and rewards that are capped by what raters say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from uard import _checks
+from uard.method import pooled, rater_statistics
+from uard.method.arrays import Array, namespace, where
+from uard.method.feedback import ByRater, Feedback
+from uard.method.mitigations.protocol import Evidence, LearningSignal, Mitigation
+from uard.method.rater_statistics import RaterStatistics, masked_median
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+
+@dataclass(frozen=True)
+class RaterCap(Mitigation):
+    """Learn from a middle of what the raters say, or from the reward where that is lower; unrated, from the reward.
+
+    Examples:
+        >>> from uard.ratings.stream import RewardStream
+        >>> for cap in (RaterCap("median"), RaterCap("median", cap=False)):
+        ...     print(RewardStream(cap)([4.0, 0.0], [[-1.0, 2.0, 1.0], [1.0, 0.5, 0.5]]).reward.tolist())
+        [1.0, 0.0]
+        [1.0, 0.5]
+
+    Attributes:
+        statistic: ``mean`` or ``median`` over the raters' own running means.
+        cap: Whether the reward is only capped by it: min(reward, statistic).
+    """
+
+    statistic: Literal["mean", "median"] = "median"
+    cap: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
+        _checks.choose("statistic", self.statistic, ("mean", "median"))
+        _checks.instance("cap", self.cap, bool, "true or false")
+
+    def signal(self, evidence: Evidence, statistics: Any) -> LearningSignal:
+        """Return the statistic or the reward, whichever is lower if it is a cap."""
+        each, r = each_rater(evidence.feedback), evidence.reward
+        here = each.count > 0
+        if self.statistic == "median":
+            middle = masked_median(each.mean, here, axis=-1)
+        else:
+            xp = namespace(each.mean)
+            raters = xp.sum(xp.astype(here, each.mean.dtype), axis=-1)
+            middle = xp.sum(where(here, each.mean, 0.0), axis=-1) / xp.maximum(raters, xp.ones_like(raters))
+        rated = namespace(r).minimum(r, middle) if self.cap else middle
+        return LearningSignal(where(evidence.feedback.count > 0, rated, r), 1.0)
+
+
+@dataclass(frozen=True)
+class ExcessDisagreement(Mitigation):
+    """Cap the reward by the pooled mean less what raters differ by beyond their own noise: min(r, m - k tau).
+
+    Examples:
+        >>> from uard.ratings.stream import RewardStream
+        >>> stream = RewardStream(ExcessDisagreement())
+        >>> rewards, ratings = [4.0] + 9 * [-0.1], [[-1.0, 2.0, 1.0]] + 9 * [[-0.1] * 3]
+        >>> for _ in range(9):
+        ...     out = stream(rewards, ratings, keys=range(10))
+        >>> bool(out.reward[0] < -0.8), out.reward[1:3].round(1).tolist()
+        (True, [-0.1, -0.1])
+
+    Attributes:
+        k: How many tau are taken off, >= 0.
+    """
+
+    refits_early: ClassVar[bool] = True
+
+    k: float = 1.5
+
+    def __post_init__(self) -> None:
+        """Check the parameter.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
+        _checks.number("k", self.k, low=0)
+
+    def fit(self, feedback: Feedback, rated: Bool[Array, "*batch"]) -> RaterStatistics:
+        """Measure the raters."""
+        return fit_raters(feedback, rated)
+
+    def signal(self, evidence: Evidence, statistics: RaterStatistics) -> LearningSignal:
+        """Return the capped reward; unrated, the reward as far as it is usual."""
+        each, r = each_rater(evidence.feedback), evidence.reward
+        here = (each.count > 0) & (statistics.heard > 0)
+        variance = pooled.errors(r, each, statistics, slack=0.0)
+        said = pooled.pool(r, each.mean - statistics.bias, here, variance, statistics.span)
+        cap = pooled.precise_mean(each.mean - statistics.bias, here, variance) - self.k * said.tau
+        u = statistics.typical
+        unrated = namespace(r).minimum(r, u + 0.0 * r)
+        return LearningSignal(where(said.heard > 0, namespace(r).minimum(r, cap), unrated), 1.0)
+
+
+def each_rater(feedback: Feedback) -> ByRater:
+    """Return what each rater has said.
+
+    Examples:
+        >>> import numpy as np
+        >>> from uard.ratings.aggregate import aggregate
+        >>> each_rater(aggregate(np.array([[1.0, 3.0]]), np.zeros(1))).mean.tolist()
+        [[1.0, 3.0]]
+
+    Raises:
+        InvalidValueError: only what all raters say together is known.
+    """
+    if feedback.by_rater is None:
+        raise _checks.InvalidValueError("feedback.by_rater", None, "each rater's ratings: this rule asks who said what")
+    return feedback.by_rater
+
+
+def fit_raters(feedback: Feedback, rated: Bool[Array, "*batch"]) -> RaterStatistics:
+    """Return the statistics of all raters over state-actions of any shape.
+
+    Examples:
+        >>> import numpy as np
+        >>> from uard.ratings.aggregate import aggregate
+        >>> feedback = aggregate(np.array([[1.0, 3.0], [0.0, 2.0]]), np.array([1.0, 0.0]))
+        >>> fit_raters(feedback, feedback.count > 0).heard.tolist()
+        [1.0, 1.0]
+
+    Args:
+        feedback: Of every state-action.
+        rated: Which of them were rated.
+    """
+    xp = namespace(feedback.mean)
+
+    def flat(x: Float[Array, "*batch K"]) -> Float[Array, "n K"]:
+        return xp.reshape(x, (-1, x.shape[-1]))
+
+    reward, rated = xp.reshape(feedback.proxy, (-1,)), xp.reshape(rated, (-1,))
+    return rater_statistics.fit(reward, ByRater._make(map(flat, each_rater(feedback))), rated)

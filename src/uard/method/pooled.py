@@ -1,0 +1,227 @@
+"""The pooled rule: is every rater centred at the reward, or do raters scatter about a truth of their own?
+
+Of a state-action with observed reward r, raters k = 1..K have said z_k on average, each with an error of variance v_k.
+Two hypotheses explain it:
+
+* *centred*: the reward tells the truth, so z_k ~ N(r, v_k);
+* *apart*: it does not; z_k ~ N(m, v_k + tau^2) about a truth m that may be anything within the span of what is ever
+  said. tau^2, by which raters differ beyond their own errors, is DerSimonian and Laird's [1986], and m is marginalised
+  by Laplace's approximation.
+
+With a prior share of lies, the weight is the posterior of the first, w = 1 / (1 + odds): the paper's reciprocal filter,
+whose doubt is now the odds that the reward lies. What is learned is drawn towards a cautious pool of what raters say.
+The statistics of the panel (who is how noisy, biased, idiosyncratic) are ``uard.method.rater_statistics``.
+
+Pure functions of NumPy, JAX or torch arrays. Nothing here reads a value estimate, so that with any weights the Bellman
+operator on what is learned is a contraction (Theorem 1).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from uard.method.arrays import Array, Numbers, namespace
+from uard.method.feedback import ByRater
+from uard.method.rater_statistics import RaterStatistics
+from uard.method.uncertainty import root
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+LARGEST_ODDS = 50.0  # of their logarithm: beyond it a weight is 0 or 1 in any precision
+OUTLIER = 3.0  # standard deviations from what the others say, beyond which a rater dissents
+EXPERT = 2.0  # times more precise than the others: then a lone dissenter is no veto
+FEWEST = 5  # raters at a state-action among whom one dissenter may be overruled; each further one needs two more
+
+
+class Pool(NamedTuple):
+    """What raters say together of some state-actions, in reward units.
+
+    Attributes:
+        heard: Number of raters who count.
+        centre: Their pooled mean under *apart*.
+        tau: By how much they differ beyond their own errors, a standard deviation: sigma_h.
+        error: Standard error of ``centre``; 0 where nobody is heard.
+        log_odds: Logarithm of the odds of *apart* against *centred* without the prior, 0 where nobody is heard.
+    """
+
+    heard: Float[Array, "*batch"]
+    centre: Float[Array, "*batch"]
+    tau: Float[Array, "*batch"]
+    error: Float[Array, "*batch"]
+    log_odds: Float[Array, "*batch"]
+
+
+def errors(
+    reward: Float[Array, "*batch"], by_rater: ByRater, statistics: RaterStatistics, slack: Numbers
+) -> Float[Array, "*batch K"]:
+    """Return the variance v_k of each rater's mean about what the rater means, in squared reward units.
+
+    The variance of one answer is the rater's own over all state-actions, corrected by what was seen here; to the error
+    of the mean come the rater's idiosyncrasy and a slack that grows with how unusual the reward is.
+
+    Examples:
+        >>> import numpy as np
+        >>> from uard.method import rater_statistics
+        >>> reward = np.array([0.0, 0.0, 10.0])
+        >>> twice = ByRater(np.full((3, 1), 2.0), reward[:, None], np.full((3, 1), 0.5))
+        >>> statistics = rater_statistics.fit(reward, twice, np.ones(3, bool))
+        >>> errors(reward, twice, statistics, slack=0.1).round(2).tolist()
+        [[0.24], [0.24], [1.24]]
+
+    Args:
+        reward: Observed.
+        by_rater: What each rater has said here.
+        statistics: Of the panel.
+        slack: By which share of an unusual reward a rater may be off without a reason, >= 0.
+    """
+    xp, n = namespace(by_rater.mean), by_rater.count
+    one = xp.ones_like(n)
+    answer = (4.0 * statistics.noise + by_rater.m2) / (4.0 + xp.maximum(n - 1.0, 0.0 * one))
+    off = slack * (reward - statistics.typical)
+    return answer / xp.maximum(n, one) + statistics.idiosyncrasy + 2.0 * statistics.floor + (off * off)[..., None]
+
+
+def pool(
+    reward: Float[Array, "*batch"],
+    said: Float[Array, "*batch K"],
+    here: Bool[Array, "*batch K"],
+    variance: Float[Array, "*batch K"],
+    span: Numbers,
+) -> Pool:
+    """Weigh the two hypotheses against each other.
+
+    Examples:
+        >>> import numpy as np
+        >>> said, here, variance = np.array([[2.0, 4.0]]), np.ones((1, 2), bool), np.ones((1, 2))
+        >>> pooled = pool(np.array([3.0]), said, here, variance, span=10.0)
+        >>> pooled.centre.tolist(), pooled.tau.tolist(), pooled.error.round(3).tolist()
+        ([3.0], [1.0], [1.0])
+
+    Args:
+        reward: Observed.
+        said: Each rater's mean without the rater's bias; may hold anything where nobody was heard.
+        here: Who is heard.
+        variance: Of each rater's error, > 0.
+        span: Within how wide a range truths lie, > 0.
+    """
+    xp = namespace(said)
+    zero = xp.zeros_like(said)
+    tau2 = variance_between(said, here, variance)
+    mean = _mean(said, here, variance + tau2[..., None])
+    anybody = mean.total > 0
+    widened = xp.where(here, xp.log1p(tau2[..., None] / variance) + mean.weight * mean.gap**2, zero)
+    apart = -0.5 * (xp.sum(widened, axis=-1) + xp.log1p(span * span * mean.total))
+    from_reward = xp.where(here, (said - reward[..., None]) ** 2 / variance, zero)
+    nothing = xp.zeros_like(mean.total)
+    return Pool(
+        heard=xp.sum(xp.astype(here, said.dtype), axis=-1),
+        centre=mean.centre,
+        tau=root(tau2),
+        error=xp.where(anybody, 1.0 / xp.sqrt(xp.where(anybody, mean.total, nothing + 1.0)), nothing),
+        log_odds=xp.where(anybody, apart + 0.5 * xp.sum(from_reward, axis=-1), nothing),
+    )
+
+
+def variance_between(
+    said: Float[Array, "*batch K"], here: Bool[Array, "*batch K"], variance: Float[Array, "*batch K"]
+) -> Float[Array, "*batch"]:
+    """Return tau^2, the variance of raters about each other beyond their own errors [DerSimonian and Laird 1986].
+
+    Examples:
+        >>> import numpy as np
+        >>> variance_between(np.array([[2.0, 4.0]]), np.ones((1, 2), bool), np.ones((1, 2))).tolist()
+        [1.0]
+
+    Args:
+        said: What each rater says.
+        here: Who is heard.
+        variance: Of each rater's error, > 0.
+    """
+    xp, mean = namespace(said), _mean(said, here, variance)
+    zero = xp.zeros_like(mean.total)
+    raters = xp.sum(xp.astype(here, said.dtype), axis=-1)
+    excess = xp.maximum(xp.sum(mean.weight * mean.gap**2, axis=-1) - (raters - 1.0), zero)
+    several = raters > 1.0
+    squares = xp.sum(mean.weight**2, axis=-1) / xp.where(several, mean.total, zero + 1.0)
+    return xp.where(several, excess / xp.where(several, mean.total - squares, zero + 1.0), zero)
+
+
+def overruled(
+    said: Float[Array, "*batch K"],
+    here: Bool[Array, "*batch K"],
+    variance: Float[Array, "*batch K"],
+    noise: Float[Array, " K"],
+    vetoes: int,
+) -> Bool[Array, "*batch K"]:
+    """Return who is still heard after so many vetoes were overruled.
+
+    A veto is the lowest word of five raters or more (seven for a second, and so on) that is three standard deviations
+    below what the others say, as they differ, from somebody who is no more precise than they are: a lone expert is
+    heard, one who merely hates something is not.
+
+    Examples:
+        >>> import numpy as np
+        >>> said, here = np.array([[10.0, 10.0, 10.0, 10.0, -3.0]]), np.ones((1, 5), bool)
+        >>> overruled(said, here, np.full((1, 5), 0.1), np.full(5, 0.1), vetoes=1).tolist()
+        [[True, True, True, True, False]]
+
+    Args:
+        said: What each rater says, without biases.
+        here: Who is heard.
+        variance: Of each rater's error, > 0.
+        noise: Variance of one answer of each rater.
+        vetoes: How many may be overruled, >= 0.
+    """
+    xp, raters = namespace(said), said.shape[-1]
+    zero = xp.zeros_like(said)
+    count = xp.sum(xp.astype(here, said.dtype), axis=-1)
+    for number in range(min(vetoes, max(0, raters - FEWEST + 2) // 2)):
+        lowest = xp.argmin(xp.where(here, said, zero + xp.finfo(said.dtype).max), axis=-1)
+        dissenter = (xp.arange(raters) == lowest[..., None]) & here
+        others = here & ~dissenter
+        tau2 = variance_between(said, others, variance)
+        distance = _mean(said, others, variance).centre[..., None] - said
+        alone = distance > OUTLIER * xp.sqrt(variance + tau2[..., None])
+        left = xp.sum(xp.astype(others, said.dtype), axis=-1)
+        usual = xp.sum(xp.where(others, zero + noise, zero), axis=-1) / xp.maximum(left, xp.ones_like(left))
+        imprecise = noise >= usual[..., None] / EXPERT**2
+        enough = count >= FEWEST + 2 * number
+        here = here & ~(dissenter & alone & imprecise & enough[..., None])
+    return here
+
+
+def precise_mean(
+    said: Float[Array, "*batch K"], here: Bool[Array, "*batch K"], variance: Float[Array, "*batch K"]
+) -> Float[Array, "*batch"]:
+    """Return the mean of what raters say, each weighed by the inverse of their variance; 0 where nobody is heard.
+
+    Examples:
+        >>> import numpy as np
+        >>> precise_mean(np.array([[1.0, 4.0]]), np.ones((1, 2), bool), np.array([[1.0, 2.0]])).tolist()
+        [2.0]
+
+    Args:
+        said: What each rater says.
+        here: Who is heard.
+        variance: Of each rater's error, > 0.
+    """
+    return _mean(said, here, variance).centre
+
+
+class _Mean(NamedTuple):
+    """A precision-weighted mean over the raters who are heard; 0 where nobody is."""
+
+    weight: Float[Array, "*batch K"]
+    total: Float[Array, "*batch"]
+    centre: Float[Array, "*batch"]
+    gap: Float[Array, "*batch K"]
+
+
+def _mean(said: Float[Array, "*batch K"], here: Bool[Array, "*batch K"], variance: Float[Array, "*batch K"]) -> _Mean:
+    xp = namespace(said)
+    zero = xp.zeros_like(said)
+    weight, held = xp.where(here, 1.0 / variance, zero), xp.where(here, said, zero)
+    total = xp.sum(weight, axis=-1)
+    centre = xp.sum(weight * held, axis=-1) / xp.where(total > 0, total, xp.ones_like(total))
+    return _Mean(weight, total, centre, held - centre[..., None])
