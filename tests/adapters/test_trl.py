@@ -258,7 +258,7 @@ def test_a_late_judge_is_missing_named_counted_and_warned_of_once():
     assert reward.tally.missing == {"a": 0, "b": 0, "slow": 4}
     assert means["uard/slow/missing"] == 1
     assert 0.2 <= means["uard/slow/seconds"] < 10
-    assert 0 <= means["uard/a/seconds"]
+    assert means["uard/a/seconds"] >= 0
 
 
 def test_one_limit_is_that_of_every_judge():
