@@ -92,11 +92,11 @@ def test_seconds_are_those_of_the_judge():
         await asyncio.sleep(0.1)
 
     def works(**question):
-        time.sleep(0.3)
+        time.sleep(1)
 
     answers = ask({"naps": naps, "works": works}, QUESTION)
-    assert 0.1 <= answers["naps"].seconds < 0.29  # it was over before the other
-    assert answers["works"].seconds >= 0.3
+    assert 0.1 <= answers["naps"].seconds < 0.9  # it was over before the other
+    assert answers["works"].seconds >= 1
 
 
 def test_the_process_ends_though_judges_hang():
