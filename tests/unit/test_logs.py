@@ -372,6 +372,19 @@ def test_options_decide():
         logs.from_columns(columns, rater="usr")
 
 
+def test_a_column_divides_the_items_of_a_long_log():
+    columns = {"item": list("aab"), "rater": list("xyx"), "rating": [1, 2, 3], "system": ["m", "m", "n"]}
+    assert logs.from_columns(columns, by="system").by.tolist() == ["m", "n"]
+    with pytest.raises(
+        InvalidValueError, match=r"item 'a', column 'system' = \('m', 'o'\): must be the same in all rows"
+    ):
+        logs.from_columns(columns | {"system": list("mon")}, by="system")
+    with pytest.raises(InvalidValueError, match="by = 'rating': must be a column that is neither"):
+        logs.from_columns(columns, by="rating")
+    wide = {"reward": [1, 2], "rating_a": [1, 2], "item": ["a", "b"]}
+    assert logs.from_columns(wide, by="item").by.tolist() == ["a", "b"]
+
+
 BAD_LONG = [
     ({"item": ["a", None], "rater": ["x", "y"], "rating": [1, 2]}, "row 2, column 'item' = None: must be a name"),
     ({"item": ["a", "b"], "rater": ["x", ""], "rating": [1, 2]}, "row 2, column 'rater' = None: must be a name"),

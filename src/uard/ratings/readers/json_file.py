@@ -95,6 +95,7 @@ def _columns(
     columns: dict[str, list[Any]] = {}
     others: dict[str, None] = {}
     gaps: dict[str, int] = {}
+    same: dict[str, str] = {}  # names come again and again, and one text is enough
     count = 0
 
     def put(name: str, cells: list[Any]) -> None:
@@ -114,7 +115,7 @@ def _columns(
                 for part, cell in enumerate(cast("list[Any]", value)):
                     put(f"{name}[{part}]", [cell])
             else:
-                put(name, [value])
+                put(name, [same.setdefault(value, value) if isinstance(value, str) else value])
         count += 1
     for name in columns:
         put(name, [])
