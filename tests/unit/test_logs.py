@@ -510,6 +510,16 @@ def test_questions_of_tools_are_chosen_by_name(tmp_path):
         assert message in str(error.value)
 
 
+def test_an_export_without_answers_and_a_log_whose_columns_only_look_like_one(tmp_path):
+    path = tmp_path / "export.json"
+    for entry in ({"id": 1, "data": {}, "annotations": []}, {"id": 1, "fields": {}, "responses": {}}):
+        path.write_text(json.dumps([entry]))
+        with pytest.raises(InvalidValueError, match="must be an export with at least one answer"):
+            logs.read(path)
+    path.write_text(json.dumps([{"responses": ["yes", "no"], "fields": 3, "reward": 1, "rating": 2}]))
+    assert logs.read(path).ratings.tolist() == [[2.0]]
+
+
 def test_one_user_of_potato(tmp_path):
     """The 1.x lines of one user do not name the user, who is in the folder's name; those of all users are refused."""
     line = '{"id": "11", "displayed_text": "a", "label_annotations": {"quality": {"scale_5": "5"}}}\n'

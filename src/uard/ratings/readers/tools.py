@@ -31,7 +31,7 @@ def rows_of(first: Row, path: Path, named: Collection[str]) -> Callable[[Row], I
         return lambda task: label_studio(task, path, named)
     if isinstance(first.get("label_annotations"), dict) or "instance_id_to_label_to_value" in first:
         return lambda entry: potato(entry, path)
-    if "responses" in first or any(_is_answers(x) for x in first.values()):
+    if _is_argilla(first):
         return lambda record: argilla(record, named)
     return None
 
@@ -119,6 +119,15 @@ def argilla(record: Row, named: Collection[str] = ()) -> Iterator[Row]:
                 | {"item": item, "annotator": answer.get("user_id"), "created_at": when}
                 | {f"{question}{SCHEMA}": value}
             )
+
+
+def _is_argilla(record: Row) -> bool:
+    """Whether these are responses of Argilla's, and not those of a model, which a log may have in such a column too."""
+    responses: Any = record.get("responses")
+    if not responses:
+        return {"responses", "fields"} <= record.keys() or any(_is_answers(x) for x in record.values())
+    by_question = isinstance(responses, dict) and all(isinstance(x, list | None) for x in _mapping(responses).values())
+    return by_question or any("values" in _mapping(x) for x in _list(responses))
 
 
 def _is_answers(cell: Any) -> bool:
