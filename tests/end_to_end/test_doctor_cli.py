@@ -105,7 +105,20 @@ def test_columns(log, capsys):
         ("empty.csv", "log = 'empty.csv': must be a CSV file whose first line names its columns"),
         ("nothing", "log = 'nothing': must be a file that ends in .csv"),
         ("uard/TrapGird6-v0", "log = 'uard/TrapGird6-v0': must be a file that ends in .csv"),
-        ("uard/TrapGrid6-v0 --set pannel=main", "set = {'pannel': 'main'}: must be keywords of uard/TrapGrid6-v0"),
+        ("module:os", "log = 'module:os': must be a file that ends in .csv"),
+        (":", "log = ':': must be a file that ends in .csv"),
+        ("uard/TrapGrid6-v0 --set pannel=main", "keyword of TrapGrid6 = 'pannel': must be one of goal, "),
+        ("CartPole-v1 --set panel=main", "keyword of CartPole-v1 = 'panel': must be one of render_mode, "),
+        (
+            "uard/TrapGrid6-v0 --set size=5 --set size=6",
+            "--set = 'size=6': must be given once for each name: size has",
+        ),
+        ("uard/TrapGrid6-v0 --by item", "--by = 'item': must be left out: it is for a file"),
+        ("uard/TrapGrid6-v0 --reward score", "--reward = 'score': must be left out: it is for a file"),
+        ("log.csv --set a=b", "--set = ('a=b',): must be left out: it is for an environment, and log.csv is none"),
+        ("log.csv --steps 5", "--steps = 5: must be left out: it is for an environment"),
+        ("log.csv --seed 0", "--seed = 0: must be left out: it is for an environment"),
+        ("log.csv --by nope", "log.csv: column = 'nope': must be one of rating_ann, rating_bob, reward"),
         ("uard/TrapGrid6-v0 --set panel=mian", "panel = 'mian': must be one of"),
         ("uard/TrapGrid6-v0 --steps 0", "steps = 0: must be a whole number >= 1"),
         ("uard/TrapGrid6-v0 --seed -1", "seed = -1: must be a whole number >= 0"),
@@ -119,3 +132,25 @@ def test_bad_input(arguments, message, tmp_path, monkeypatch, capsys):
     assert (code, out) == (2, "")
     assert error.startswith(f"error: {message}")
     assert error.count("\n") == 1
+
+
+def test_agreement_within_parts(log, capsys):
+    text = "reward,rating_ann,rating_bob,system\n" + "0,0.1,-0.1,a\n1,1.1,0.9,a\n5,4.8,5.2,b\n5,5.2,4.8,b\n" * 10
+    code, out, _ = doctor(capsys, log(text), "--by", "system", "--json", "-")
+    answer = json.loads(out)
+    a, b = answer["strata"]
+    assert (code, a["name"], a["rows"], b["name"]) == (0, "a", 20, "b")
+    assert a["agreement"] > 0.9
+    assert b["agreement"] < 0
+    assert a["low"] <= a["agreement"] <= a["high"]
+    assert len(answer["agreement_interval"]) == 2
+    _, out, _ = doctor(capsys, log(text), "--by", "system")
+    assert "            within a: 0." in out
+
+
+@pytest.mark.parametrize("size", ["1e-310", "5e-324", "1e-200", "1e99", "1e308"])
+def test_json_of_numbers_of_any_size(log, capsys, size):
+    rows = "".join(f"{i % 2 * float(size)},{i % 3 * float(size) / 3},{i % 2 * float(size)}\n" for i in range(40))
+    _, out, error = doctor(capsys, log("reward,rating_1,rating_2\n" + rows), "--json", "-")
+    assert json.loads(out, parse_constant=lambda name: pytest.fail(name))["rows"] == 40
+    assert error == ""

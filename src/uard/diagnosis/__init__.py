@@ -2,6 +2,6 @@
 
 from uard.diagnosis.case import PRINTED
 from uard.diagnosis.doctor import CODES, doctor, filtered
-from uard.diagnosis.finding import SEVERITIES, Diagnosis, Finding
+from uard.diagnosis.finding import SEVERITIES, Diagnosis, Finding, Stratum
 
-__all__ = ["CODES", "PRINTED", "SEVERITIES", "Diagnosis", "Finding", "doctor", "filtered"]
+__all__ = ["CODES", "PRINTED", "SEVERITIES", "Diagnosis", "Finding", "Stratum", "doctor", "filtered"]

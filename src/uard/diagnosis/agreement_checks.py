@@ -139,20 +139,24 @@ def mixed_units(case: Case) -> Finding | None:
     unit = units(case)
     if unit is None:
         return None
-    both, names = case.pairs_of_raters, [case.log.raters[k] for k in case.sample.raters]
+    both, names = case.pairs_of_raters, case.sample.names
     middle, spread = np.nanmedian(case.sample.ratings[:, unit >= 0], 0), np.diag(both.sd)[unit >= 0]
     of = dict(zip(np.flatnonzero(unit >= 0), zip(middle, spread, strict=True), strict=True))
     numbers = {f"median_{names[k]}": float(m) for k, (m, _) in of.items()}
     numbers |= {f"spread_{names[k]}": float(s) for k, (_, s) in of.items()}
     groups = [np.flatnonzero(unit == u) for u in range(unit.max() + 1)]
-    groups.sort(key=lambda g: (-len(g), abs(of[g[0]][0] - float(np.median(case.reward)))))
-    parts, maps = [], []
+    usual = float(np.median(case.reward))
+    groups.sort(key=lambda g: (-len(g), abs(float(np.median([of[k][0] for k in g])) - usual)))
+    parts: list[str] = []
+    maps: list[str] = []
     for number, group in enumerate(groups):
         parts.append(listed(f"{names[k]} (median {of[k][0]:.3g}, spread {of[k][1]:.3g})" for k in group))
         for k in group if number else ():
-            j = groups[0][int(np.argmax(both.rows[k, groups[0]]))]
-            slope = float(both.sd[j, k] / both.sd[k, j]) if both.sd[k, j] > 0 else 0.0
-            offset = float(both.mean[j, k] - slope * both.mean[k, j])
+            to = groups[0][(both.rows[k, groups[0]] >= 10) & (both.sd[k, groups[0]] > 0)]
+            if not to.size:
+                continue
+            slope = float((both.sd[to, k] / both.sd[k, to]).mean())
+            offset = float((both.mean[to, k] - slope * both.mean[k, to]).mean())
             numbers |= {f"slope_{names[k]}": slope, f"offset_{names[k]}": offset}
             maps.append(f"{slope:.3g} {names[k]} {offset:+.3g}")
     return Finding(
@@ -161,8 +165,8 @@ def mixed_units(case: Case) -> Finding | None:
         f"Raters who agree on which rows are better rate in {len(groups)} units: {'; against '.join(parts)}.",
         "Their mean, their lowest and their disagreement are of the unit with the largest numbers: sigma_h is large "
         "where nobody disagrees, and one rater decides.",
-        f"Bring them into one unit first. On the rows that both rated, {listed(maps)} has the mean and the spread of "
-        f"{listed(names[k] for k in groups[0])}.",
+        f"Bring them into one unit first, that of {listed(names[k] for k in groups[0])}"
+        + (f": on the rows that both rated, {listed(maps)} has its mean and spread." if maps else "."),
         numbers,
     )
 

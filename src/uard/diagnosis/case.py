@@ -50,6 +50,7 @@ class Sample(NamedTuple):
     Attributes:
         rows: Numbers of its rows among those of the case.
         raters: Numbers of its m raters.
+        names: Their names.
         reward: Rewards of its rows.
         ratings: Ratings of its rows, NaN where one is missing.
         others: Mean rating of all other raters of the log; NaN where nobody else rated.
@@ -57,6 +58,7 @@ class Sample(NamedTuple):
 
     rows: Integer[np.ndarray, " n"]
     raters: Integer[np.ndarray, " m"]
+    names: tuple[str, ...]
     reward: Float[np.ndarray, " n"]
     ratings: Float[np.ndarray, "n m"]
     others: Float[np.ndarray, "n m"]
@@ -115,7 +117,8 @@ class Case:
         ratings = ratings[:, raters]
         beside = count - np.isfinite(ratings)
         others = np.where(beside > 0, (total - np.nan_to_num(ratings)) / np.maximum(beside, 1), np.nan)
-        return Sample(rows, raters, self.reward[rows], ratings, others)
+        names = tuple(self.log.raters[int(k)] for k in raters)
+        return Sample(rows, raters, names, self.reward[rows], ratings, others)
 
     @cached_property
     def pairs_with_reward(self) -> Shared:

@@ -116,7 +116,7 @@ class Diagnosis:
         data = asdict(self)
         if self.independence is not None:
             data["independence"]["effective"] = self.independence.effective
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in data.items()}
+        return data | {name: list(data[name]) for name in ("raters", "strata", "findings")}
 
     def __str__(self) -> str:
         """Return the whole diagnosis as text, 100 columns wide."""

@@ -27,7 +27,7 @@ def idle_raters(case: Case) -> Finding | None:
     idle: list[str] = []
     numbers: dict[str, float] = {}
     reward, ratings = case.sample.reward, case.sample.ratings
-    names = [case.log.raters[k] for k in case.sample.raters]
+    names = case.sample.names
     alike = _look_alike(case)
     for k, name in enumerate(names):
         column = ratings[:, k]
@@ -73,7 +73,7 @@ def _look_alike(case: Case) -> list[list[int]]:
     """
     ratings = case.sample.ratings
     n, raters = ratings.shape
-    rows = np.unique(np.linspace(0, n - 1, min(n, max(100, 2 * COMPARISONS // max(raters, 1) ** 2))).astype(int))
+    rows = np.unique(np.linspace(0, n - 1, min(n, max(100, 2 * COMPARISONS // max(raters, 1) ** 2)), dtype=int))
     values = ratings[rows].T
     here = np.isfinite(values)
     rounded = np.round(np.where(here, values, 0.0) / (100 * ROUNDING * case.unit))
@@ -271,26 +271,23 @@ def _typical(x: Float[np.ndarray, " n"]) -> float:
 def too_constant(case: Case) -> Finding | None:
     """Raters whose answers vary far less than what the others agree on."""
     sample, both = case.sample, case.pairs_of_raters
-    if sample.raters.size < 2:
+    if sample.raters.size < 3:
         return None
     # What all raters see is in the covariance of any two, and no rater of the same scale can vary by less.
-    with_reward = case.pairs_with_reward
-    covariance = with_reward.correlation * with_reward.sd * with_reward.sd.T
-    told = (with_reward.rows >= FEW) & (with_reward.correlation * np.sqrt(with_reward.rows) > TELLING)
+    told = (both.rows >= FEW) & (both.correlation * np.sqrt(both.rows) > TELLING)
     np.fill_diagonal(told, False)
-    covariance, told = np.where(told, covariance, 0.0), told.astype(float)
+    covariance = np.where(told, both.correlation * both.sd * both.sd.T, 0.0)
     total, pairs = covariance.sum() - 2 * covariance.sum(1), told.sum() - 2 * told.sum(1)
-    seen = (
-        np.minimum(1.0, with_reward.sd[-1] / max(float(with_reward.sd[-1, -1]), 1e-100)) ** 2
-    )  # in the rater's own rows
-    signal = (seen * np.where(pairs > 0, total / np.maximum(pairs, 1.0), 0.0))[:-1]
+    reward = case.pairs_with_reward.sd[-1]
+    seen = np.minimum(1.0, reward[:-1] / max(float(reward[-1]), 1e-100)) ** 2  # of all that varies, in the rater's rows
+    signal = seen * np.where(pairs > 0, total / np.maximum(pairs, 1), 0.0)
     own = np.array([np.nanvar(x) if np.isfinite(x).sum() >= FEW else np.inf for x in sample.ratings.T])
     unit = units(case)
     alone = np.full(own.size, True) if unit is None else unit < 0
     flat = np.flatnonzero((own > 0) & (own * FLAT**2 < signal) & alone & (both.rows.diagonal() >= FEW))
     if not flat.size:
         return None
-    names = [case.log.raters[sample.raters[k]] for k in flat]
+    names = [sample.names[k] for k in flat]
     spread = [(float(np.sqrt(own[k])), float(np.sqrt(signal[k]))) for k in flat]
     return Finding(
         "too-constant",
@@ -332,21 +329,24 @@ def copied_ratings(case: Case) -> Finding | None:
     spread = sd * sd.T
     told = (both.rows >= FEW) & usable & usable[:, None] & ~np.eye(len(sd), dtype=bool)
     covariance = np.where(told, both.correlation * spread, -np.inf)
-    chance = (3.0 + np.sqrt(2.0 * np.log(max(told.sum() / 2, 2)))) / np.sqrt(np.maximum(both.rows, 1))
+    error = spread / np.sqrt(np.maximum(both.rows, 1.0))
+    z = 1.5 + np.sqrt(2.0 * np.log(max(told.sum() / 2, 2)))
     parts: list[str] = []
     numbers: dict[str, float] = {}
-    for i, j in zip(*np.nonzero(np.triu(told & (both.correlation > np.maximum(chance, 0.5)))), strict=True):
-        third = np.maximum(covariance[i], covariance[j])
-        third[[i, j]] = -np.inf
-        if not np.isfinite(third).any() or len(parts) >= MOST_PAIRS:
+    for i, j in zip(*np.nonzero(np.triu(told & (both.correlation > 0.5) & (covariance > z * error))), strict=True):
+        own, others = covariance[i, j], covariance[[i, j]].copy()
+        others[:, [i, j]] = -np.inf
+        if not np.isfinite(others).any() or len(parts) >= MOST_PAIRS:
             continue
-        beside = max(float(third.max()), 0.0)
-        above = covariance[i, j] - beside
-        if above < chance[i, j] * spread[i, j] or above < 0.6 * (spread[i, j] - beside):
+        beside = max(float(others.max()), 0.0)
+        if (
+            own - beside < 0.6 * (spread[i, j] - beside)
+            or (own - others < z * np.hypot(error[i, j], error[[i, j]])).any()
+        ):
             continue
         if _equal(sample.ratings[:, i], sample.ratings[:, j], case.unit) >= 0.99:
             continue  # named by idle_raters
-        a, b = (case.log.raters[sample.raters[k]] for k in (i, j))
+        a, b = sample.names[int(i)], sample.names[int(j)]
         numbers[f"correlation_{a}_{b}"] = float(both.correlation[i, j])
         parts.append(
             f"{a} and {b} ({both.correlation[i, j]:.2f}, by the other raters at most {beside / spread[i, j]:.2f})"

@@ -39,12 +39,12 @@ def sample_of_rows(n: int, raters: int) -> Integer[np.ndarray, " m"]:
         raters: Its columns.
     """
     most = min(100_000, max(500, CELLS // max(raters, 1)))
-    return np.unique(np.linspace(0, n - 1, min(n, most)).astype(int))
+    return np.unique(np.linspace(0, n - 1, min(n, most), dtype=int))
 
 
 def sample_of_raters(raters: int) -> Integer[np.ndarray, " m"]:
     """Return raters at even distances, all of them if they are no more than ``MOST_RATERS``."""
-    return np.unique(np.linspace(0, raters - 1, min(raters, MOST_RATERS)).astype(int))
+    return np.unique(np.linspace(0, raters - 1, min(raters, MOST_RATERS), dtype=int))
 
 
 def shared(ratings: Float[np.ndarray, "n K"]) -> Shared:
@@ -101,7 +101,7 @@ def residuals(ratings: Float[np.ndarray, "n K"], against: Float[np.ndarray, "n p
     Returns:
         (n, K): NaN where a rating is missing or a column is not known, and of raters with too few rows for a line.
     """
-    known = np.isfinite(against).all(1)
+    known = np.all(np.isfinite(against), axis=1)
     line = np.where(known[:, None], against, 0.0)
     line = line / np.maximum(np.abs(line).max(0, initial=0.0), 1e-100)
     design = np.column_stack([np.ones(len(line)), line])

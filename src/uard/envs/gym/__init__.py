@@ -66,7 +66,7 @@ def make(
     Raises:
         InvalidValueError: naming the field, the value and what is allowed.
     """
-    kind, _ = names.KINDS[_checks.choose("environment", environment, IDS.values())]
+    kind: Any = names.KINDS[_checks.choose("environment", environment, IDS.values())][0]
     for field in fields:
         known = [f.name for f in dataclasses.fields(kind) if f.init]
         _checks.choose(f"keyword of {environment}", field, [*known, "panel", "noise", "render_mode"])
