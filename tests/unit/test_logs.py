@@ -548,7 +548,7 @@ def test_placeholders_are_named_all_at_once_and_can_be_declared(tmp_path):
     assert "the first in row 1, by column, with counts = {'rating_1': {'?': 2}, 'rating_2': {'x': 1}}" in str(
         error.value
     )
-    assert "missing=('?', ...) or --missing '?'" in str(error.value)
+    assert "missing=('?',) or --missing '?'" in str(error.value)
     expected = [[np.nan, np.nan], [np.nan, 2], [np.nan, np.nan], [4, np.nan]]
     assert np.array_equal(logs.read(tmp_path / "log.csv", missing=("?", "X")).ratings, expected, equal_nan=True)
     with pytest.raises(InvalidValueError, match=r"missing = '\?': must be several texts"):
@@ -557,7 +557,12 @@ def test_placeholders_are_named_all_at_once_and_can_be_declared(tmp_path):
     assert np.array_equal(logs.from_columns(text, missing=["?"]).ratings, [[np.nan], [2]], equal_nan=True)
 
 
-def test_a_number_that_means_missing_does_so_among_ratings_alone():
+def test_a_number_that_means_missing_does_so_among_ratings_alone(tmp_path):
+    """In a file too, whatever else is in the column."""
+    (tmp_path / "log.csv").write_text("reward,rating\n0,0\nn/a,n/a\n0,3\n")
+    log = logs.read(tmp_path / "log.csv", missing=["0"])
+    assert np.array_equal(log.reward, [0, np.nan, 0], equal_nan=True)
+    assert np.array_equal(log.ratings[:, 0], [np.nan, np.nan, 3], equal_nan=True)
     log = logs.from_columns({"reward": [0, -1], "rating_a": [0, 3], "rating_b": [2, -1]}, missing=("0", "-1.0"))
     assert log.reward.tolist() == [0, -1]
     assert np.array_equal(log.ratings, [[np.nan, 2], [3, np.nan]], equal_nan=True)
