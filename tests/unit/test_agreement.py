@@ -123,3 +123,7 @@ def test_independence_by_hand():
     assert independence(ratings[:29], truth[:29]) is None
     assert independence(np.tile(truth[:, None], 2), truth) is None  # nobody errs
     assert independence(ratings, np.full(100, np.nan)) is None
+    with pytest.raises(InvalidValueError, match="against"):
+        independence(ratings, truth[:5])
+    with pytest.raises(InvalidValueError, match="item"):
+        alpha_interval(ratings, np.arange(5))

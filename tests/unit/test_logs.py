@@ -786,3 +786,24 @@ def test_a_log_without_rewards_is_not_filtered():
     found = doctor(log)
     assert [f.code for f in found.findings] == ["few-ratings", "one-rater", "no-rewards"]
     json.dumps(found.as_data(), allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "code"),
+    [
+        (lambda own, other: np.full(200, 3.0), "idle-raters"),
+        (lambda own, other: other, "idle-raters"),
+        (lambda own, other: np.where(np.arange(200) % 4 == 0, 0.0, own), "sentinel-value"),
+        (lambda own, other: 25 * (own - 1), "mixed-units"),
+        (lambda own, other: own, None),
+    ],
+)
+def test_raters_are_checked_without_rewards(spoilt, code):
+    """Three raters of one quality from 1 to 5, the third of whom is as said."""
+    random = np.random.default_rng(0)
+    quality = random.uniform(1, 5, 200)
+    a, b, c = quality + random.normal(0, 0.3, (3, 200))
+    columns = {"item": [*range(200)] * 3, "rater": ["a"] * 200 + ["b"] * 200 + ["c"] * 200}
+    found = doctor(columns | {"rating": np.concatenate([a, b, spoilt(c, b)])})
+    assert [f.code for f in found.findings] == [*([code] if code else []), "no-rewards"]
+    json.dumps(found.as_data(), allow_nan=False)

@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uard import InvalidValueError, RatingLog, doctor
-from uard.diagnosis import agreement_checks, rater_checks
+from uard.diagnosis import agreement_checks, copy_checks, rater_checks, sentinel_checks
 from uard.diagnosis.case import as_filter, case_of
 
 CHECKS = (
-    rater_checks.sentinel_value,
+    sentinel_checks.sentinel_value,
     rater_checks.straight_lines,
     rater_checks.too_constant,
-    rater_checks.copied_ratings,
+    copy_checks.copied_ratings,
     agreement_checks.mixed_units,
 )
 OF_RATERS = ("sentinel-value", "straight-lining", "too-constant", "copied-ratings", "mixed-units")
@@ -223,7 +223,7 @@ def test_copies_among_two_thousand_raters_are_found():
     truth = random.normal(size=100)
     ratings = truth[:, None] + random.normal(0.0, 0.5, (100, 2000))
     ratings[:, 1999] = ratings[:, 3]
-    found = rater_checks.idle_raters(case_of(RatingLog(truth, ratings), "uard", as_filter("uard")))
+    found = copy_checks.idle_raters(case_of(RatingLog(truth, ratings), "uard", as_filter("uard")))
     assert found is not None
     assert found.numbers == {"rating_2000_repeats_rating_4": 1.0}
 

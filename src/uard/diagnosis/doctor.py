@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uard import _checks
-from uard.diagnosis import agreement_checks, filter_checks, log_checks, rater_checks, truth_checks
+from uard.diagnosis import (
+    agreement_checks,
+    copy_checks,
+    filter_checks,
+    log_checks,
+    rater_checks,
+    sentinel_checks,
+    truth_checks,
+)
 from uard.diagnosis.case import Case, as_filter, case_of, feedback_of, filtered_rows, numbered
 from uard.diagnosis.finding import SEVERITIES, Diagnosis, Finding
 from uard.diagnosis.self_consistency import self_consistency
@@ -129,8 +137,8 @@ RATER_CHECKS: tuple[Callable[[Case], Finding | None], ...] = (
     log_checks.no_rewards,
     log_checks.few_ratings,
     log_checks.missing_ratings,
-    rater_checks.idle_raters,
-    rater_checks.sentinel_value,
+    copy_checks.idle_raters,
+    sentinel_checks.sentinel_value,
     agreement_checks.mixed_units,
     agreement_checks.one_rater,
     self_consistency,
@@ -139,11 +147,11 @@ RATER_CHECKS: tuple[Callable[[Case], Finding | None], ...] = (
 CHECKS: tuple[Callable[[Case], Finding | None], ...] = (
     log_checks.few_ratings,
     log_checks.missing_ratings,
-    rater_checks.idle_raters,
-    rater_checks.sentinel_value,
+    copy_checks.idle_raters,
+    sentinel_checks.sentinel_value,
     rater_checks.straight_lines,
     rater_checks.too_constant,
-    rater_checks.copied_ratings,
+    copy_checks.copied_ratings,
     agreement_checks.mixed_units,
     agreement_checks.one_rater,
     self_consistency,

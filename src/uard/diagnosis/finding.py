@@ -132,9 +132,10 @@ class Diagnosis:
             alpha = "not defined" if s.agreement is None else f"{s.agreement:.3f}"
             lines.append(f"            within {s.name}: {alpha} ({interval(s.low, s.high)}{row_count(s.rows)})")
         if (i := self.independence) is not None:
+            errors = "their errors" if i.against == "true_reward" else "what the reward misses, error or truth,"
             lines.append(
                 f"raters      a row's {i.raters:.3g} are worth {i.effective:.3g} independent ones (mean correlation of "
-                f"errors against {i.against} {i.correlation:.2f})"
+                f"{errors} {i.correlation:.2f})"
             )
         for sigma, values in (self.calibration or {}).items():
             shown = ", ".join(f"{name} {value:.3f}" for name, value in values.items())

@@ -109,7 +109,9 @@ def _parts(ratings: object, item: Any = None) -> Float[np.ndarray, "items 4"] | 
     parts = np.column_stack([m, m * within / (m - 1), once, (x * x).sum(1)])
     if item is None:
         return parts
-    numbers = np.unique(np.asarray(item)[several], return_inverse=True)[1]
+    items = np.asarray(item)
+    _checks.same_shape("item", items, "ratings[:, 0]", several)
+    numbers = np.unique(items[several], return_inverse=True)[1]
     return np.column_stack([np.bincount(numbers, column) for column in parts.T])
 
 
@@ -170,9 +172,15 @@ def independence(ratings: object, against: object, name: str = "true_reward") ->
     Returns:
         None unless two raters have rated 30 rows together, where ``against`` is known, and both make errors. Beyond
         2000 raters and 2 000 000 ratings a sample at even distances is taken.
+
+    Raises:
+        InvalidValueError: for other shapes.
     """
     x, truth = _checks.as_numpy("ratings", ratings), _checks.as_numpy("against", against)
+    if x.ndim != 2:
+        raise _checks.InvalidValueError("ratings.shape", x.shape, "(n, K): a row per thing rated")
     several = np.isfinite(x).sum(1)
+    _checks.same_shape("against", truth, "ratings[:, 0]", several)
     several = several[several > 1]
     columns = sample_of_raters(x.shape[1])
     if not several.size or columns.size < 2:
