@@ -372,6 +372,19 @@ def test_options_decide():
         logs.from_columns(columns, rater="usr")
 
 
+def test_a_column_divides_the_items_of_a_long_log():
+    columns = {"item": list("aab"), "rater": list("xyx"), "rating": [1, 2, 3], "system": ["m", "m", "n"]}
+    assert logs.from_columns(columns, by="system").by.tolist() == ["m", "n"]
+    with pytest.raises(
+        InvalidValueError, match=r"item 'a', column 'system' = \('m', 'o'\): must be the same in all rows"
+    ):
+        logs.from_columns(columns | {"system": list("mon")}, by="system")
+    with pytest.raises(InvalidValueError, match="by = 'rating': must be a column that is neither"):
+        logs.from_columns(columns, by="rating")
+    wide = {"reward": [1, 2], "rating_a": [1, 2], "item": ["a", "b"]}
+    assert logs.from_columns(wide, by="item").by.tolist() == ["a", "b"]
+
+
 BAD_LONG = [
     ({"item": ["a", None], "rater": ["x", "y"], "rating": [1, 2]}, "row 2, column 'item' = None: must be a name"),
     ({"item": ["a", "b"], "rater": ["x", ""], "rating": [1, 2]}, "row 2, column 'rater' = None: must be a name"),
@@ -497,6 +510,16 @@ def test_questions_of_tools_are_chosen_by_name(tmp_path):
         assert message in str(error.value)
 
 
+def test_an_export_without_answers_and_a_log_whose_columns_only_look_like_one(tmp_path):
+    path = tmp_path / "export.json"
+    for entry in ({"id": 1, "data": {}, "annotations": []}, {"id": 1, "fields": {}, "responses": {}}):
+        path.write_text(json.dumps([entry]))
+        with pytest.raises(InvalidValueError, match="must be an export with at least one answer"):
+            logs.read(path)
+    path.write_text(json.dumps([{"responses": ["yes", "no"], "fields": 3, "reward": 1, "rating": 2}]))
+    assert logs.read(path).ratings.tolist() == [[2.0]]
+
+
 def test_one_user_of_potato(tmp_path):
     """The 1.x lines of one user do not name the user, who is in the folder's name; those of all users are refused."""
     line = '{"id": "11", "displayed_text": "a", "label_annotations": {"quality": {"scale_5": "5"}}}\n'
@@ -525,7 +548,7 @@ def test_placeholders_are_named_all_at_once_and_can_be_declared(tmp_path):
     assert "the first in row 1, by column, with counts = {'rating_1': {'?': 2}, 'rating_2': {'x': 1}}" in str(
         error.value
     )
-    assert "missing=('?', ...) or --missing '?'" in str(error.value)
+    assert "missing=('?',) or --missing '?'" in str(error.value)
     expected = [[np.nan, np.nan], [np.nan, 2], [np.nan, np.nan], [4, np.nan]]
     assert np.array_equal(logs.read(tmp_path / "log.csv", missing=("?", "X")).ratings, expected, equal_nan=True)
     with pytest.raises(InvalidValueError, match=r"missing = '\?': must be several texts"):
@@ -534,7 +557,12 @@ def test_placeholders_are_named_all_at_once_and_can_be_declared(tmp_path):
     assert np.array_equal(logs.from_columns(text, missing=["?"]).ratings, [[np.nan], [2]], equal_nan=True)
 
 
-def test_a_number_that_means_missing_does_so_among_ratings_alone():
+def test_a_number_that_means_missing_does_so_among_ratings_alone(tmp_path):
+    """In a file too, whatever else is in the column."""
+    (tmp_path / "log.csv").write_text("reward,rating\n0,0\nn/a,n/a\n0,3\n")
+    log = logs.read(tmp_path / "log.csv", missing=["0"])
+    assert np.array_equal(log.reward, [0, np.nan, 0], equal_nan=True)
+    assert np.array_equal(log.ratings[:, 0], [np.nan, np.nan, 3], equal_nan=True)
     log = logs.from_columns({"reward": [0, -1], "rating_a": [0, 3], "rating_b": [2, -1]}, missing=("0", "-1.0"))
     assert log.reward.tolist() == [0, -1]
     assert np.array_equal(log.ratings, [[np.nan, 2], [3, np.nan]], equal_nan=True)
@@ -757,4 +785,25 @@ def test_a_log_without_rewards_is_not_filtered():
         filtered(log)
     found = doctor(log)
     assert [f.code for f in found.findings] == ["few-ratings", "one-rater", "no-rewards"]
+    json.dumps(found.as_data(), allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "code"),
+    [
+        (lambda own, other: np.full(200, 3.0), "idle-raters"),
+        (lambda own, other: other, "idle-raters"),
+        (lambda own, other: np.where(np.arange(200) % 4 == 0, 0.0, own), "sentinel-value"),
+        (lambda own, other: 25 * (own - 1), "mixed-units"),
+        (lambda own, other: own, None),
+    ],
+)
+def test_raters_are_checked_without_rewards(spoilt, code):
+    """Three raters of one quality from 1 to 5, the third of whom is as said."""
+    random = np.random.default_rng(0)
+    quality = random.uniform(1, 5, 200)
+    a, b, c = quality + random.normal(0, 0.3, (3, 200))
+    columns = {"item": [*range(200)] * 3, "rater": ["a"] * 200 + ["b"] * 200 + ["c"] * 200}
+    found = doctor(columns | {"rating": np.concatenate([a, b, spoilt(c, b)])})
+    assert [f.code for f in found.findings] == [*([code] if code else []), "no-rewards"]
     json.dumps(found.as_data(), allow_nan=False)

@@ -181,6 +181,7 @@ def case_of(log: RatingLog, name: str, method: Mitigation) -> Case:
     def outcome(name: str, method: Mitigation) -> FilterOutcome:
         return FilterOutcome(name, method, *filtered_rows(method, reward, sigma_m, known, distinct))
 
+    chosen = outcome(name, method)
     deviation = float(reward.std())
     return Case(
         log=log,
@@ -195,9 +196,9 @@ def case_of(log: RatingLog, name: str, method: Mitigation) -> Case:
         together=together,
         unit=deviation if deviation > 1e-12 * np.abs(reward).max() else 1.0,
         noise=_noise(known.sd[together], known.raters[together]),
-        chosen=outcome(name, method),
+        chosen=chosen,
         printed=outcome(PRINTED, as_filter(PRINTED)),
-        recommended=outcome("uard", as_filter("uard")),
+        recommended=chosen if name == "uard" else outcome("uard", as_filter("uard")),
     )
 
 

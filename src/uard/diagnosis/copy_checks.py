@@ -27,7 +27,8 @@ def idle_raters(case: Case) -> Finding | None:
     for k, name in enumerate(names):
         column = ratings[:, k]
         here = np.isfinite(column)
-        if here.sum() >= FEW and np.ptp(column[here]) == 0 and np.ptp(reward[here]) > 0:
+        constant = here.sum() >= FEW and np.ptp(column[here]) == 0
+        if constant and (case.log.reward is None or np.ptp(reward[here]) > 0):
             idle.append(f"{name} rates every row {column[here][0]:g}")
             numbers[f"constant_{name}"] = float(column[here][0])
         elif (share := _equal(column, reward, case.unit)) >= 0.99:

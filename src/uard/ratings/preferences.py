@@ -12,10 +12,10 @@ import numpy as np
 
 from uard import _checks
 from uard.ratings.log import bad_cell
-from uard.ratings.readers import table
 from uard.ratings.readers.columns import MISSING, Choice, Numbers, name_of
+from uard.ratings.readers.formats import table
 from uard.ratings.readers.layout import RATERS
-from uard.ratings.readers.pairs import Sides, sides_among
+from uard.ratings.readers.sides import Sides, sides_among
 from uard.ratings.readers.spelling import among, normal
 
 if TYPE_CHECKING:

@@ -28,30 +28,19 @@ the doctor reports them. Numbers are plain decimals: neither ``1_000`` nor True 
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from uard import _checks
 from uard.ratings.log import RatingLog
-from uard.ratings.readers.columns import Choice, Numbers, Wanted, cells_of, names_in
-from uard.ratings.readers.csv_file import read_csv
-from uard.ratings.readers.json_file import read_json, read_jsonl
+from uard.ratings.readers.columns import Numbers, Wanted, cells_of, names_in
+from uard.ratings.readers.formats import FORMATS, table
 from uard.ratings.readers.layout import LogChoice, layout_of
 from uard.ratings.readers.long_form import long_log
-from uard.ratings.readers.parquet import read_parquet
 from uard.ratings.readers.wide_form import wide_log
 
-FORMATS: dict[str, Callable[[Path, Choice, Numbers], tuple[dict[str, Any], list[str]]]] = {
-    ".csv": read_csv,
-    ".tsv": read_csv,
-    ".jsonl": read_jsonl,
-    ".ndjson": read_jsonl,
-    ".json": read_json,
-    ".parquet": read_parquet,
-    ".pq": read_parquet,
-}
+__all__ = ["FORMATS", "from_columns", "read"]
 
 
 def read(
@@ -102,30 +91,6 @@ def read(
     numbers = Numbers(wanted.source, wanted.missing)
     columns, names = table(path, LogChoice(wanted), numbers)
     return _log(columns, names, wanted, numbers)
-
-
-def table(path: str | Path, choice: Choice, numbers: Numbers) -> tuple[dict[str, Any], list[str]]:
-    """Read the chosen columns of a file; used by ``read`` and ``uard.ratings.preferences``.
-
-    Returns:
-        The columns by name, and the names of all columns.
-
-    Raises:
-        InvalidValueError: see ``read``.
-    """
-    path = Path(path)
-    reader = FORMATS.get(path.suffix.lower())
-    if reader is None or "\0" in str(path):
-        raise _checks.InvalidValueError("log", str(path), f"a file that ends in {', '.join(FORMATS)}")
-    try:
-        return reader(path, choice, numbers)
-    except OSError as error:
-        why = os.strerror(error.errno) if error.errno else error
-        raise _checks.InvalidValueError("log", str(path), f"a file that can be read ({why})") from None
-    except UnicodeDecodeError as error:
-        raise _checks.InvalidValueError(
-            "log", str(path), f"UTF-8 text (byte {error.start}: {error.object[error.start : error.start + 1]!r})"
-        ) from None
 
 
 def from_columns(

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "-", "<na>", "#n/a"))
-A_NUMBER = "a number, or nothing where it is missing (missing=, --missing name the words that say so)"
+A_NUMBER = "a number, or nothing where it is missing"
 _MANY = 100  # kinds of unreadable cells after which there is no use in looking for more
 _SHOWN = 5  # kinds of unreadable cells that a message names
 
@@ -134,7 +134,7 @@ class Numbers:
 
     def __post_init__(self) -> None:
         """Tell words from numbers among what is missing."""
-        self._words = MISSING | {word.strip().lower() for word in self.missing}
+        self._words = MISSING | {word.strip().lower() for word in self.missing if math.isnan(_parsed(word))}
         self._numbers = [x for word in self.missing if not math.isnan(x := _parsed(word))]
 
     def of_text(self, cells: Sequence[str], column: str, start: int = 0) -> Float[np.ndarray, " n"]:
@@ -176,17 +176,17 @@ class Numbers:
         """
         if not self.bad:
             return
+        word = next((cell for _, _, cell in self.bad.values() if isinstance(cell, str)), None)
+        hint = "" if word is None else f"; missing=({word!r},) or --missing {word!r} say that a word means so"
         count, row, cell = next(iter(self.bad.values()))
         if len(self.bad) == 1 and count == 1:
-            raise bad_cell(self.source, row, next(iter(self.bad))[0], cell, A_NUMBER)
+            raise bad_cell(self.source, row, next(iter(self.bad))[0], cell, A_NUMBER + hint)
         found: dict[str, dict[str, int]] = {}
         for (column, word), (count, _, _) in sorted(self.bad.items(), key=lambda kind: -kind[1][0])[:_SHOWN]:
             found.setdefault(column, {})[word] = count
         more = f" and {len(self.bad) - _SHOWN} other kinds" if len(self.bad) > _SHOWN else ""
         first = min(row for _, row, _ in self.bad.values())
         where = f"{self.source}: cells that are no numbers{more}, the first in row {first + 1}, by column, with counts"
-        word = next((cell for _, _, cell in self.bad.values() if isinstance(cell, str)), None)
-        hint = "" if word is None else f"; missing=({word!r}, ...) or --missing {word!r} say that a word means so"
         raise _checks.InvalidValueError(where, found, f"numbers, or nothing where one is missing{hint}")
 
     def _from_text(self, cell: str, row: int, column: str) -> float:

@@ -74,6 +74,8 @@ def _table(entries: Iterator[dict[str, Any]], path: Path, choice: Choice) -> tup
     entries = chain([first], entries)
     rows = entries if flatten is None else (row for entry in entries for row in flatten(entry))
     columns, others, gaps = _columns(rows, choice)
+    if flatten is not None and not columns:
+        raise _checks.InvalidValueError("log", str(path), "an export with at least one answer that is a rating")
     for name in [n for n in columns if f"{n}[0]" in columns]:
         row = next((i for i, x in enumerate(columns[name]) if x is not None), None)
         if row is not None:
@@ -95,6 +97,7 @@ def _columns(
     columns: dict[str, list[Any]] = {}
     others: dict[str, None] = {}
     gaps: dict[str, int] = {}
+    same: dict[str, str] = {}  # names come again and again, and one text is enough
     count = 0
 
     def put(name: str, cells: list[Any]) -> None:
@@ -114,7 +117,7 @@ def _columns(
                 for part, cell in enumerate(cast("list[Any]", value)):
                     put(f"{name}[{part}]", [cell])
             else:
-                put(name, [value])
+                put(name, [same.setdefault(value, value) if isinstance(value, str) else value])
         count += 1
     for name in columns:
         put(name, [])

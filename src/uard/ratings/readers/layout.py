@@ -10,7 +10,7 @@ from typing import NamedTuple
 from uard import _checks
 from uard.ratings.log import LABELS, NUMBERS
 from uard.ratings.readers.columns import Choice, Wanted
-from uard.ratings.readers.pairs import sides_among
+from uard.ratings.readers.sides import sides_among
 from uard.ratings.readers.spelling import TIMES, among, normal
 
 RATERS = frozenset((

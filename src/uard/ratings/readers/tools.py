@@ -31,7 +31,7 @@ def rows_of(first: Row, path: Path, named: Collection[str]) -> Callable[[Row], I
         return lambda task: label_studio(task, path, named)
     if isinstance(first.get("label_annotations"), dict) or "instance_id_to_label_to_value" in first:
         return lambda entry: potato(entry, path)
-    if "responses" in first or any(_is_answers(x) for x in first.values()):
+    if _is_argilla(first):
         return lambda record: argilla(record, named)
     return None
 
@@ -41,6 +41,12 @@ def label_studio(task: Row, path: Path, named: Collection[str] = ()) -> Iterator
 
     Answers are the results of type ``rating``, ``number`` and ``choices`` of all annotations that were not cancelled.
     The item is the task's id, the rater ``completed_by`` (the e-mail if it is there), the question ``from_name``.
+
+    Examples:
+        >>> answer = {"from_name": "quality", "type": "rating", "value": {"rating": 4}}
+        >>> task = {"id": 1, "data": {}, "annotations": [{"completed_by": 7, "result": [answer]}]}
+        >>> list(label_studio(task, Path("export.json")))
+        [{'annotator': 7, 'created_at': None, 'item': 1, 'quality:::': 4}]
 
     Args:
         task: With ``annotations`` and ``data``.
@@ -82,6 +88,10 @@ def argilla(record: Row, named: Collection[str] = ()) -> Iterator[Row]:
     of lists like those of 2.x. Answers that are discarded, drafts or pending are left out. The item is the record's
     id, or else its external id.
 
+    Examples:
+        >>> list(argilla({"id": 1, "responses": {"quality": [{"value": 4, "user_id": "ann"}]}}))
+        [{'item': 1, 'annotator': 'ann', 'created_at': None, 'quality:::': 4}]
+
     Args:
         record: One record.
         named: Columns that are taken from its ``metadata`` or ``fields``.
@@ -111,6 +121,15 @@ def argilla(record: Row, named: Collection[str] = ()) -> Iterator[Row]:
             )
 
 
+def _is_argilla(record: Row) -> bool:
+    """Whether these are responses of Argilla's, and not those of a model, which a log may have in such a column too."""
+    responses: Any = record.get("responses")
+    if not responses:
+        return {"responses", "fields"} <= record.keys() or any(_is_answers(x) for x in record.values())
+    by_question = isinstance(responses, dict) and all(isinstance(x, list | None) for x in _mapping(responses).values())
+    return by_question or any("values" in _mapping(x) for x in _list(responses))
+
+
 def _is_answers(cell: Any) -> bool:
     return bool(_list(cell)) and {"user_id", "value"} <= _mapping(_list(cell)[0]).keys()
 
@@ -119,6 +138,11 @@ def potato(entry: Row, path: Path) -> Iterator[Row]:
     """Yield the answers of a line of potato's JSONL (1.x, one line per item) or of its JSON (2.x, one user per file).
 
     A line that does not say whose it is belongs to the user after whom potato names the file's folder.
+
+    Examples:
+        >>> line = {"user_id": "ann", "id": "1", "label_annotations": {"quality": {"scale_4": "4"}}}
+        >>> list(potato(line, Path("annotated_instances.jsonl")))
+        [{'item': '1', 'annotator': 'ann', 'quality:::': '4'}]
 
     Args:
         entry: A line with ``label_annotations``, or a user with ``instance_id_to_label_to_value``.
