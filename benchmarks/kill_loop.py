@@ -54,7 +54,8 @@ def finished(store: Path) -> dict[tuple[str, int], tuple[Any, ...]]:
 def kill(process: subprocess.Popen[str], number: signal.Signals, after: float) -> tuple[int, float, str]:
     """Wait, then send a signal; return exit code, seconds until the end, and what was said."""
     try:
-        return process.wait(after), 0.0, ""
+        said = process.communicate(timeout=after)[1]
+        return process.returncode, 0.0, said
     except subprocess.TimeoutExpired:
         began = time.monotonic()
         process.send_signal(number)
@@ -70,8 +71,9 @@ def loop(options: argparse.Namespace, folder: Path) -> list[str]:
     """Return what went wrong."""
     began = time.monotonic()
     undisturbed = start(folder / "undisturbed.sqlite", options)
-    if undisturbed.communicate()[1] is None or undisturbed.returncode:
-        return [f"the undisturbed study ended with {undisturbed.returncode}"]
+    said = undisturbed.communicate()[1]
+    if undisturbed.returncode:
+        return [f"the undisturbed study ended with {undisturbed.returncode}: {said}"]
     seconds, want = time.monotonic() - began, finished(folder / "undisturbed.sqlite")
     chance, wrong, counted, rounds, slowest = random.Random(options.seed), [], Counter[str](), 0, 0.0
     while counted.total() < options.kills:
