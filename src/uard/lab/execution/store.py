@@ -6,6 +6,7 @@ It also says who is training what, so that several processes share the work, and
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 import time
 from collections import Counter, defaultdict
@@ -166,7 +167,7 @@ class Store:
         self.path = str(path)
         if readonly and not Path(self.path).is_file():
             raise StoreError(f"store = {self.path!r}: must be a result store, but there is no such file")
-        self.readonly = readonly or (Path(self.path).is_file() and not can_be_written(self.path))
+        self.readonly = readonly or (os.path.isfile(self.path) and not can_be_written(self.path))
         self._damaged_rows: dict[int, DamagedSeed] = {}  # by rowid
         self._damaged_cells: dict[str, DamagedSeed] = {}
         self._leaving = ExitStack()
