@@ -98,7 +98,10 @@ def loop(options: argparse.Namespace, folder: Path) -> list[str]:
             before = after
         if finished(store) != want:
             wrong.append(f"study {rounds}: not what the undisturbed one has")
-    print(f"{dict(counted)}, {rounds} studies of {len(want)} seeds; slowest end {slowest:.1f} s; {len(wrong)} wrong")
+        said = (
+            f"{dict(counted)}, {rounds} studies of {len(want)} seeds; slowest end {slowest:.1f} s; {len(wrong)} wrong"
+        )
+        print(said, flush=True)
     return wrong
 
 
