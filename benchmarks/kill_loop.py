@@ -73,9 +73,9 @@ def loop(options: argparse.Namespace, folder: Path) -> list[str]:
     undisturbed = start(folder / "undisturbed.sqlite", options)
     said = undisturbed.communicate()[1]
     if undisturbed.returncode:
-        return [f"the undisturbed study ended with {undisturbed.returncode}: {said}"]
+        sys.exit(f"the undisturbed study ended with {undisturbed.returncode}: {said}")
     seconds, want = time.monotonic() - began, finished(folder / "undisturbed.sqlite")
-    chance, wrong, counted, rounds, slowest = random.Random(options.seed), [], Counter[str](), 0, 0.0
+    chance, wrong, counted, rounds, slowest, told = random.Random(options.seed), [], Counter[str](), 0, 0.0, 0
     while counted.total() < options.kills:
         rounds += 1
         store, before, code = folder / f"{rounds}.sqlite", {}, None
@@ -83,7 +83,7 @@ def loop(options: argparse.Namespace, folder: Path) -> list[str]:
             last = counted.total() >= options.kills
             number = chance.choice([signal.SIGKILL] * 3 + [signal.SIGTERM, signal.SIGINT])
             process = start(store, options)
-            code, took, said = kill(process, number, 600 if last else chance.uniform(0.2, 1.2) * seconds)
+            code, took, said = kill(process, number, 600 if last else chance.uniform(0.1, 0.9) * seconds)
             if code == 0:
                 break
             counted[number.name] += 1
@@ -101,7 +101,8 @@ def loop(options: argparse.Namespace, folder: Path) -> list[str]:
         said = (
             f"{dict(counted)}, {rounds} studies of {len(want)} seeds; slowest end {slowest:.1f} s; {len(wrong)} wrong"
         )
-        print(said, flush=True)
+        print("\n".join([said, *wrong[told:]]), flush=True)
+        told = len(wrong)
     return wrong
 
 
@@ -115,7 +116,6 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         wrong = loop(options, Path(folder))
-    print("\n".join(wrong))
     sys.exit(bool(wrong))
 
 
