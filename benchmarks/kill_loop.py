@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -59,12 +59,12 @@ def kill(process: subprocess.Popen[str], number: signal.Signals, after: float) -
     except subprocess.TimeoutExpired:
         began = time.monotonic()
         process.send_signal(number)
-    try:
-        said = process.communicate(timeout=60)[1]
-    except subprocess.TimeoutExpired:
-        process.kill()
-        said = process.communicate()[1]
-    return process.returncode, time.monotonic() - began, said
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(60)
+    took = time.monotonic() - began
+    process.kill()  # if it has not ended
+    said = process.communicate()[1]  # waits for workers that are still starting, too
+    return process.returncode, took, said
 
 
 def loop(options: argparse.Namespace, folder: Path) -> list[str]:
