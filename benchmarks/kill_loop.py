@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -54,26 +54,28 @@ def finished(store: Path) -> dict[tuple[str, int], tuple[Any, ...]]:
 def kill(process: subprocess.Popen[str], number: signal.Signals, after: float) -> tuple[int, float, str]:
     """Wait, then send a signal; return exit code, seconds until the end, and what was said."""
     try:
-        return process.wait(after), 0.0, ""
+        said = process.communicate(timeout=after)[1]
+        return process.returncode, 0.0, said
     except subprocess.TimeoutExpired:
         began = time.monotonic()
         process.send_signal(number)
-    try:
-        said = process.communicate(timeout=60)[1]
-    except subprocess.TimeoutExpired:
-        process.kill()
-        said = process.communicate()[1]
-    return process.returncode, time.monotonic() - began, said
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(60)
+    took = time.monotonic() - began
+    process.kill()  # if it has not ended
+    said = process.communicate()[1]  # waits for workers that are still starting, too
+    return process.returncode, took, said
 
 
 def loop(options: argparse.Namespace, folder: Path) -> list[str]:
     """Return what went wrong."""
     began = time.monotonic()
     undisturbed = start(folder / "undisturbed.sqlite", options)
-    if undisturbed.communicate()[1] is None or undisturbed.returncode:
-        return [f"the undisturbed study ended with {undisturbed.returncode}"]
+    said = undisturbed.communicate()[1]
+    if undisturbed.returncode:
+        sys.exit(f"the undisturbed study ended with {undisturbed.returncode}: {said}")
     seconds, want = time.monotonic() - began, finished(folder / "undisturbed.sqlite")
-    chance, wrong, counted, rounds, slowest = random.Random(options.seed), [], Counter[str](), 0, 0.0
+    chance, wrong, counted, rounds, slowest, told = random.Random(options.seed), [], Counter[str](), 0, 0.0, 0
     while counted.total() < options.kills:
         rounds += 1
         store, before, code = folder / f"{rounds}.sqlite", {}, None
@@ -81,7 +83,7 @@ def loop(options: argparse.Namespace, folder: Path) -> list[str]:
             last = counted.total() >= options.kills
             number = chance.choice([signal.SIGKILL] * 3 + [signal.SIGTERM, signal.SIGINT])
             process = start(store, options)
-            code, took, said = kill(process, number, 600 if last else chance.uniform(0.2, 1.2) * seconds)
+            code, took, said = kill(process, number, 600 if last else chance.uniform(0.1, 0.9) * seconds)
             if code == 0:
                 break
             counted[number.name] += 1
@@ -96,7 +98,11 @@ def loop(options: argparse.Namespace, folder: Path) -> list[str]:
             before = after
         if finished(store) != want:
             wrong.append(f"study {rounds}: not what the undisturbed one has")
-    print(f"{dict(counted)}, {rounds} studies of {len(want)} seeds; slowest end {slowest:.1f} s; {len(wrong)} wrong")
+        said = (
+            f"{dict(counted)}, {rounds} studies of {len(want)} seeds; slowest end {slowest:.1f} s; {len(wrong)} wrong"
+        )
+        print("\n".join([said, *wrong[told:]]), flush=True)
+        told = len(wrong)
     return wrong
 
 
@@ -110,7 +116,6 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         wrong = loop(options, Path(folder))
-    print("\n".join(wrong))
     sys.exit(bool(wrong))
 
 

@@ -266,3 +266,11 @@ def test_a_full_disk_loses_nothing_and_the_same_command_goes_on(tmp_path):
     assert again.returncode == 0, again.stderr
     assert f"{120 - len(kept)} runs trained, {len(kept)} were in s.sqlite already" in again.stderr
     assert kept.items() <= blobs(tmp_path / "s.sqlite").items()
+
+
+def test_the_real_program_killed_again_and_again_ends_as_if_nothing_had_happened():
+    """The loop of ``benchmarks/kill_loop.py``, which kills a hundred times, in short."""
+    loop = Path(__file__).parents[2] / "benchmarks" / "kill_loop.py"
+    command = [sys.executable, str(loop), "--kills", "5", "--seeds", "4"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=500)
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -169,7 +169,7 @@ class Store:
             raise StoreError(f"store = {self.path!r}: must be a file, not a folder")
         if readonly and not os.path.isfile(self.path):  # Path's raises for a long name
             raise StoreError(f"store = {self.path!r}: must be a result store, but there is no such file")
-        self.readonly = readonly or (Path(self.path).is_file() and not can_be_written(self.path))
+        self.readonly = readonly or (os.path.isfile(self.path) and not can_be_written(self.path))
         self._damaged_rows: dict[int, DamagedSeed] = {}  # by rowid
         self._damaged_cells: dict[str, DamagedSeed] = {}
         self._leaving = ExitStack()

@@ -239,7 +239,7 @@ def check_cells(data: Any) -> None:
     """Check that data are what ``extract`` gives: finite metrics and curves, as many as there are seeds.
 
     Examples:
-        >>> check_cells({"cells": {"a": {"config": {}, "seeds": [0], "metrics": {"hacks": [1.0, 2.0]}}}})
+        >>> check_cells({"cells": {"a": {"seeds": [0], "metrics": {"hacks": [1.0, 2.0]}}}})
         Traceback (most recent call last):
             ...
         uard._checks.InvalidValueError: cells[a].metrics.hacks.shape = (2,): must be one entry for each of 1 seeds
@@ -249,7 +249,7 @@ def check_cells(data: Any) -> None:
     """
     cells = _checks.instance("cells", data.get("cells") if isinstance(data, dict) else data, dict, "cells by key")
     for key, cell in cells.items():
-        kinds = (("config", dict, "an object"), ("seeds", list, "a list"), ("metrics", dict, "an object"))
+        kinds = (("seeds", list, "a list"), ("metrics", dict, "an object"))
         for name, kind, allowed in kinds:
             part = _checks.instance(f"cells[{key}]", cell, dict, "an object").get(name)
             _checks.instance(f"cells[{key}].{name}", part, kind, allowed)
