@@ -33,7 +33,7 @@ class UnknownNameError(InvalidValueError):
     def __init__(self, field: str, value: str, known: Iterable[str]):
         """Say that ``value`` is no ``field`` and which of the ``known`` names comes nearest."""
         names = sorted(known)
-        near = difflib.get_close_matches(str(value).lower(), names, n=1, cutoff=0.5)
+        near = difflib.get_close_matches(value.lower(), names, n=1, cutoff=0.5) if isinstance(value, str) else ()
         hint = f" (did you mean {near[0]!r}?)" if near else ""
         super().__init__(field, value, f"one of {', '.join(names)}{hint}" if names else "left out: there is none")
 

@@ -298,7 +298,7 @@ def test_fields_are_set_like_those_of_ours(example):
     with pytest.raises(InvalidValueError, match="slack = -1"):
         named("ceiling", slack=-1)
     hopper = names.ENVIRONMENTS["Hopper"]
-    with pytest.raises(InvalidValueError, match="one that can work in Locomotion"):
+    with pytest.raises(InvalidValueError, match="one that can work in Hopper"):
         Cell(hopper, agent=names.agent("softmax-dqn", {}, hopper))
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from uard import InvalidValueError
 from uard.training import checkpoint
 from uard.training.checkpoint import CheckpointError
 
@@ -45,6 +46,12 @@ def test_an_altered_byte_is_noticed(saved):
 def test_another_configuration_is_refused_by_name(saved):
     with pytest.raises(CheckpointError, match="cell 3, not cell 4"):
         checkpoint.load(saved, "cell 4", LIKE)
+
+
+def test_a_configuration_of_several_lines_could_not_be_read_again(tmp_path):
+    with pytest.raises(InvalidValueError, match=r"config = 'one\\ntwo': must be one line of text"):
+        checkpoint.save(tmp_path / "c", "one\ntwo", {"a": np.ones(2)})
+    assert not (tmp_path / "c").exists()
 
 
 def test_another_structure_is_refused(saved):

@@ -69,7 +69,7 @@ def test_a_cell_knows_what_matters_of_it():
         ({"query": "sometimes"}, "random"),
         (
             {"environment": TrapGrid(), "agent": QLearning(), "steps": None, "query": "doubtful"},
-            "random but",
+            "random, except",
         ),
     ],
 )

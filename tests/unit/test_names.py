@@ -32,9 +32,11 @@ def test_settings_are_json_or_text(pair, expected):
     assert settings((pair,)) == expected
 
 
-def test_later_settings_win():
-    assert settings(("size=6", "horizon=9", "size=8")) == {"size": 8, "horizon": 9}
+def test_settings_are_read_once_each():
+    assert settings(("size=8", "horizon=9")) == {"size": 8, "horizon": 9}
     assert settings(()) == {}
+    with pytest.raises(InvalidValueError, match=r"^--set = 'size=8': must be left out: size was set to 6 before"):
+        settings(("size=6", "horizon=9", "size=8"))
 
 
 @pytest.mark.parametrize("pair", ["size", "=12", ""])

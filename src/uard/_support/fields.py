@@ -17,13 +17,25 @@ _SCALAR = re.compile(r"(?:typing\.)?(?:(Optional)\[)?(bool|int|float|str)\]?( \|
 
 
 def check(config: Any) -> None:
-    """Check all fields of a frozen dataclass that are annotated as scalars; see ``scalar``.
+    """Check the fields of a frozen dataclass that no range says enough of.
+
+    These are what is annotated as true or false or as a text, and parts that are dataclasses themselves: one of the
+    class that is annotated, of which the default is one.
 
     Raises:
         InvalidValueError: naming the field, the value and what is allowed.
     """
     for field in dataclasses.fields(config):
-        scalar(field.name, getattr(config, field.name), field.type)
+        value = getattr(config, field.name)
+        if _kind(field.type)[0] in ("bool", "str"):
+            scalar(field.name, value, field.type)
+        part = _default(field)
+        if dataclasses.is_dataclass(part) and type(part).__name__ == field.type:
+            _checks.instance(field.name, value, type(part), f"of the class {field.type}, such as {part}")
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 
 def scalar(name: str, value: Any, annotation: Any) -> Any:

@@ -21,6 +21,7 @@ import optax
 from jax import Array, lax
 
 from uard import _checks
+from uard._support import fields
 from uard.agents import networks
 from uard.agents.networks import Ensemble, Layer, Network, Weights
 from uard.agents.off_policy import Backup, OffPolicy, RewardFn, ScoreFn, Transitions, UpdateInfo
@@ -80,6 +81,7 @@ class SoftActorCritic(OffPolicy):
         Raises:
             InvalidValueError: naming the field, the value and what is allowed.
         """
+        fields.check(self)
         _checks.number("gamma", self.gamma, low=0, high=0.9999)
         for name in ("entropy", "entropy_decay", "entropy_min"):
             _checks.number(name, getattr(self, name), low=0, high=1)

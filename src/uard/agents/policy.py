@@ -149,6 +149,7 @@ class PolicyGradient(Agent):
         Raises:
             InvalidValueError: naming the field, the value and what is allowed.
         """
+        fields.check(self)
         _checks.number("gamma", self.gamma, low=0, high=0.9999)
         _checks.number("gae_lambda", self.gae_lambda, low=0, high=1)
         _checks.whole("envs", self.envs, low=1, high=4096)
@@ -427,7 +428,6 @@ class CPO(TrustRegion):
             InvalidValueError: naming the field, the value and what is allowed.
         """
         super().__post_init__()
-        fields.check(self)
         _checks.number("limit", self.limit, low=0)
 
     @property

@@ -64,6 +64,8 @@ class QLearning(Agent):
         Raises:
             InvalidValueError: naming the field, the value and what is allowed.
         """
+        if self.abstention is not None:
+            _checks.instance("abstention", self.abstention, Abstention, "an Abstention, or none")
         _checks.whole("heads", self.heads, low=1, high=64)
         _checks.number("learning_rate", self.learning_rate, low=0, high=1, open_low=True)
         _checks.number("gamma", self.gamma, low=0, high=0.9999)

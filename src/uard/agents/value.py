@@ -20,6 +20,7 @@ import optax
 from jax import Array
 
 from uard import _checks
+from uard._support import fields
 from uard.agents import networks
 from uard.agents.networks import SINGLE, Ensemble, Network, Weights
 from uard.agents.off_policy import Backup, OffPolicy, RewardFn, ScoreFn, Transitions, UpdateInfo
@@ -77,6 +78,7 @@ class DeepQ(OffPolicy):
         Raises:
             InvalidValueError: naming the field, the value and what is allowed.
         """
+        fields.check(self)
         _checks.number("gamma", self.gamma, low=0, high=0.9999)
         for name in ("epsilon", "epsilon_decay", "epsilon_min"):
             _checks.number(name, getattr(self, name), low=0, high=1)

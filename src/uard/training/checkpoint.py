@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from uard import _checks
 from uard._support import files
 
 VERSION = 1
@@ -36,8 +37,11 @@ def save(path: Path, config: str, state: Any) -> None:
         state: Leaves that are arrays.
 
     Raises:
+        InvalidValueError: a configuration of several lines.
         FloatingPointError: a leaf holds NaN or infinity; nothing is written then.
     """
+    if "\n" in config:
+        raise _checks.InvalidValueError("config", config, "one line of text")
     leaves = {
         jax.tree_util.keystr(place): np.asarray(leaf) for place, leaf in jax.tree_util.tree_leaves_with_path(state)
     }

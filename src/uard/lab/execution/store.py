@@ -166,7 +166,7 @@ class Store:
         """
         self.path = str(path)
         if not self.path or os.path.isdir(self.path):
-            raise StoreError(f"store = {self.path!r}: must be a file, not a folder")
+            raise StoreError(f"store = {self.path!r}: must be a file that can be written, not a folder")
         if readonly and not os.path.isfile(self.path):  # Path's raises for a long name
             raise StoreError(f"store = {self.path!r}: must be a result store, but there is no such file")
         self.readonly = readonly or (os.path.isfile(self.path) and not can_be_written(self.path))

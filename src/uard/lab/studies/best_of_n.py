@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from uard import _checks
-from uard._support import fields
 from uard.lab.statistics import summarise
 from uard.method.mitigations import Evidence, Mitigation, named
 from uard.ratings.aggregate import aggregate
@@ -70,13 +69,14 @@ class Problem:
         Raises:
             InvalidValueError: naming the field, the value and what is allowed.
         """
-        fields.check(self)
         _checks.whole("features", self.features, low=2)
         _checks.whole("pool", self.pool, low=LARGEST)
         _checks.whole("models", self.models, low=2)
         _checks.whole("pairs", self.pairs, low=2)
         _checks.whole("width", self.width, low=1)
         _checks.number("ridge", self.ridge, low=0, open_low=True)
+        _checks.number("curvature", self.curvature)
+        _checks.number("flattery", self.flattery)
 
 
 class Drawn(NamedTuple):

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from uard import _checks
+from uard._support import fields
 from uard.method import adaptation, uncertainty
 from uard.method.arrays import Array, Numbers, namespace, where
 from uard.method.feedback import Feedback
@@ -66,9 +67,7 @@ class RewardDiscounting(Mitigation):
         Raises:
             InvalidValueError: naming the field, the value and what is allowed.
         """
-        _checks.instance("filter", self.filter, ReliabilityFilter, "a ReliabilityFilter")
-        _checks.truth("proxy_is_rater", self.proxy_is_rater)
-        _checks.truth("standardise", self.standardise)
+        fields.check(self)
         _checks.choose("acts_on", self.acts_on, ("reward", "score", "both"))
         _checks.choose("anchor", self.anchor, ("zero", "lowest"))
         _checks.choose("backup", self.backup, ("greedy", "consistent"))

@@ -18,6 +18,7 @@ import numpy as np
 
 from uard import _checks
 from uard._support import fields
+from uard.agents.base import Agent
 from uard.envs.base import SimulatedEnvironment
 from uard.envs.simulator import Simulator, StepResult, rate
 from uard.method.mitigations import Mitigation
@@ -70,6 +71,8 @@ class Job:
         """
         if not isinstance(self.panel, Panel):
             raise _checks.InvalidValueError("panel", self.panel, "a Panel (see uard.ratings.panels.PANELS)")
+        for name, kind in (("environment", SimulatedEnvironment), ("agent", Agent), ("mitigation", Mitigation)):
+            _checks.instance(name, getattr(self, name), kind, f"a {kind.__name__}")
         fields.check(self)
         _checks.whole("seed", self.seed)
         _checks.whole("ddof", self.ddof, low=0, high=1)
