@@ -530,3 +530,27 @@ def test_what_was_filtered_out_of_sight_is_refused_at_the_first_step():
 def test_arguments_of_another_kind_are_named(given):
     with pytest.raises(InvalidValueError, match=rf"^{next(iter(given))} = "):
         ReliabilityWrapper(Says(None), **given)
+
+
+def test_the_ensemble_learns_nothing_from_what_is_no_number():
+    """One NaN would stay in its sums for ever."""
+    box, two = S.Box(-1, 1, (2,)), S.Discrete(2)
+    ensemble = RewardEnsemble(box, two)
+    state, action = np.zeros((1, 2)), np.zeros(1, int)
+    before = ensemble(state, action)
+    for bad in (
+        (np.full((1, 2), np.nan), action, np.ones(1)),
+        (state, action, np.array([np.nan])),
+        (state, action, np.array([1e200])),
+        (state, np.array([-1]), np.ones(1)),
+        (state, np.array([2]), np.ones(1)),
+        (state, np.array([0.5]), np.ones(1)),
+    ):
+        with pytest.raises(InvalidValueError):
+            ensemble.update(*bad)
+    assert ensemble(state, action) == before
+    for space in (S.Sequence(two), S.Graph(box, two)):
+        with pytest.raises(InvalidValueError, match=r"^action_space = .*: must be one whose samples"):
+            RewardEnsemble(box, space)
+    with pytest.raises(InvalidValueError, match=r"^seed = -1"):
+        RewardEnsemble(box, two, seed=-1)
