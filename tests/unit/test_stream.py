@@ -167,6 +167,8 @@ def test_it_says_once_that_nobody_ever_rated():
         ([1.0], {"sigma_m": [np.nan]}, r"sigma_m\[0\] = nan"),
         ([1.0], {"sigma_m": [1.0, 1.0]}, r"len\(sigma_m\) = 2: must be 1, one per reward"),
         ([1.0, 2.0], {"keys": ["a"]}, r"len\(keys\) = 1: must be 2, one per reward"),
+        ([1.0], {"keys": np.array(7)}, r"keys = array\(7\): must be a list of keys"),
+        ([1.0], {"keys": iter("a")}, "keys = <.*: must be a list of keys"),
         ([1.0, 2.0], {"keys": "ab"}, "keys = 'ab': must be a list of keys"),
         ([1.0], {"keys": {"a": 1}}, "keys = {'a': 1}: must be a list of keys"),
         ([1.0, 2.0], {"keys": ["a", ["b"]]}, r"keys\[1\] = \['b'\]: must be hashable"),
