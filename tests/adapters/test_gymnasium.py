@@ -1,9 +1,12 @@
 import copy
 import pickle
+from decimal import Decimal
 
 import gymnasium
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import RecordEpisodeStatistics
 
@@ -11,7 +14,7 @@ import uard.envs  # noqa: F401 registers the ids
 from uard import InvalidValueError
 from uard.adapters.gymnasium import ReliabilityWrapper, VectorReliabilityWrapper
 from uard.adapters.reward_ensemble import RewardEnsemble
-from uard.adapters.steps import INFO
+from uard.adapters.steps import INFO, rows_of
 from uard.method.abstention import Abstention
 from uard.method.mitigations import RatedReward, Raw
 
@@ -238,6 +241,8 @@ def test_a_vector_of_grids_learns_from_all_of_them():
         ([], None, r"ratings of environment 0 = \[\]"),
         ([[1.0, 2.0]], None, r"ratings of environment 0 = \[\[1.0, 2.0\]\]"),
         ([1.0, 2.0], [float("nan")], r"reward\[0\] = nan: must be finite"),
+        ([1.0, 2.0], [1e200], r"reward\[0\] = 1e\+200"),
+        ([1.0, 1e200], None, r"ratings\[0, 1\] = 1e\+200"),
     ],
 )
 def test_training_is_never_fed_what_is_no_number(ratings, rewards, message):
@@ -276,3 +281,276 @@ def test_a_callable_that_raises_is_not_swallowed():
     env.reset()
     with pytest.raises(RuntimeError, match="went home"):
         env.step(0)
+
+
+# --- what is no row of numbers --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "ratings",
+    [
+        {17: -1.0, 42: -1.0},
+        "123",
+        ["1", "2"],
+        {1.0, 2.0},
+        (x for x in [1.0]),
+        [1j],
+        [Decimal(1)],
+        [[1.0], [2.0, 3.0]],
+        7,
+    ],
+    ids=lambda r: type(r).__name__,
+)
+def test_ratings_are_a_list_a_tuple_or_an_array_of_real_numbers(ratings):
+    with pytest.raises(InvalidValueError, match=r"^ratings of environment 0 = .*: must be a row of K finite numbers"):
+        rows_of({0: ratings}, 1)
+
+
+@pytest.mark.parametrize(
+    "ratings",
+    [
+        (1, 0),
+        [True, False],
+        np.array([1.0, None], object),
+        np.float16([1, 0]),
+        torch.tensor([1.0, 0.0], requires_grad=True),
+        [torch.tensor(1.0, requires_grad=True), np.float32(0)],
+        jnp.array([1, 0], jnp.bfloat16),
+    ],
+    ids=lambda r: type(r).__name__,
+)
+def test_ratings_of_every_library_and_precision_are_read(ratings):
+    assert np.nan_to_num(rows_of({0: ratings, 1: None}, 2))[0].tolist() == [1.0, 0.0]
+
+
+def test_ratings_by_name_are_refused_in_vectors_too():
+    vector = ReliabilityWrapper(SyncVectorEnv([lambda: Says({"ann": 1.0})]))
+    vector.reset()
+    with pytest.raises(InvalidValueError, match=r"^ratings = \{'ann': .*: must be a row of K numbers for each"):
+        vector.step(np.zeros(1, int))
+
+
+class Pays(Says):
+    """Pays what it is told to, of whatever type."""
+
+    def __init__(self, reward):
+        super().__init__([1.0, 2.0])
+        self.reward = reward
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, self.reward, *rest
+
+
+@pytest.mark.parametrize("reward", [None, "3", [1.0], np.ones(2), 1j, Decimal(1), 10**400], ids=str)
+def test_a_reward_that_is_no_number_is_named(reward):
+    env = ReliabilityWrapper(Pays(reward))
+    env.reset()
+    with pytest.raises(InvalidValueError, match=r"^reward(\.shape)? = "):
+        env.step(0)
+
+
+@pytest.mark.parametrize(
+    "reward", [3, np.float16(3), np.float32(3), torch.tensor(3.0, requires_grad=True), jnp.float32(3)]
+)
+def test_a_reward_of_every_library_is_a_number(reward):
+    env = ReliabilityWrapper(Pays(reward), Raw())
+    env.reset()
+    assert env.step(0)[1] == 3.0
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"sigma_m": lambda o, a: None}, r"^sigma_m\(\.\.\.\) = None: must be real numbers"),
+        ({"sigma_m": lambda o, a: 0.5}, r"^sigma_m\.shape = \(\): must be \(B,\)"),
+        ({"sigma_m": lambda o, a: ["1"]}, r"^sigma_m\(\.\.\.\) = \['1'\]"),
+        ({"ratings": lambda *_: None}, r"^ratings\(\.\.\.\) = None"),
+        ({"key": lambda o, a: [o]}, r"^keys\[0\] = \[.*\]: must be hashable"),
+    ],
+)
+def test_callables_that_give_nothing_to_compute_with(given, message):
+    env = ReliabilityWrapper(Says(None), **given)
+    env.reset()
+    with pytest.raises(InvalidValueError, match=message):
+        env.step(0)
+
+
+def test_a_stop_iteration_ends_nobodys_loop():
+    env = ReliabilityWrapper(Says(None), ratings=lambda *_: next(iter([])))
+    env.reset()
+    with pytest.raises(RuntimeError, match=r"^ratings\(\.\.\.\) raised StopIteration"):
+        env.step(0)
+
+
+def test_a_step_before_the_first_reset_says_so():
+    for env, action in ((Says(None), 0), (SyncVectorEnv([lambda: Says(None)]), np.zeros(1, int))):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
+            ReliabilityWrapper(env).step(action)
+
+
+# --- every space ----------------------------------------------------------------------------------------------------
+
+S = gymnasium.spaces
+SPACES = {
+    "tuple": S.Tuple((S.Discrete(2), S.Box(-1, 1, (2,)))),
+    "dict": S.Dict({"a": S.Discrete(2), "b": S.MultiBinary(3)}),
+    "sequence": S.Sequence(S.Discrete(3)),
+    "graph": S.Graph(S.Box(-1, 1, (2,)), S.Discrete(2)),
+    "one of": S.OneOf((S.Discrete(3), S.Box(-1, 1, (2,)))),
+    "text": S.Text(4),
+}
+
+
+class Samples(Says):
+    """Observations and actions of one space."""
+
+    def __init__(self, space):
+        super().__init__([1.0, 2.0], 9)
+        self.observation_space = self.action_space = space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.observation_space.seed(0)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), *super().step(action)[1:]
+
+
+@pytest.mark.parametrize("name", SPACES)
+@pytest.mark.parametrize("count", [None, 2])
+def test_every_space_is_whole_in_callables_and_keys(name, count):
+    """One observation and one action, as they are, are what a key is made of."""
+    keyed, sizes = [], []
+
+    def key(observation, action):
+        keyed.append((observation, action))
+        return len(keyed)
+
+    def sigma_m(observations, actions):
+        parts = observations
+        while isinstance(parts, dict | tuple):
+            parts = next(iter(parts.values())) if isinstance(parts, dict) else parts[0]
+        sizes.append(len(parts))
+        return np.zeros(len(parts))
+
+    make = lambda: Samples(SPACES[name])  # noqa: E731
+    env = ReliabilityWrapper(make() if count is None else SyncVectorEnv([make] * count), key=key, sigma_m=sigma_m)
+    before, _ = env.reset(seed=0)
+    space = SPACES[name]
+    action = env.action_space.sample()
+    env.step(action)
+    singles = [(before, action)]
+    if count is not None:
+        singles = zip(*(gymnasium.vector.utils.iterate(env.env.action_space, x) for x in (before, action)), strict=True)
+    assert sizes == [count or 1]
+    for (observation, acted), (was, did) in zip(keyed, singles, strict=True):
+        assert repr(acted) == repr(did) or np.array_equal(S.flatten(space, acted), S.flatten(space, did))
+        assert repr(observation) == repr(was) or np.array_equal(S.flatten(space, observation), S.flatten(space, was))
+
+
+def test_two_actions_that_differ_in_their_second_part_are_two():
+    space = S.Tuple((S.Discrete(2), S.Discrete(2)))
+    env = ReliabilityWrapper(Samples(space), key=lambda observation, action: tuple(map(int, action)))
+    env.reset()
+    env.step((1, 0))
+    env.step((1, 1))
+    assert list(env.steps.stream._slots) == [(1, 0), (1, 1)]
+
+
+def test_an_action_given_as_a_tuple_for_a_box_is_one_array():
+    class Boxed(Says):
+        action_space = S.Box(-1, 1, (2,))
+
+    seen = []
+    env = ReliabilityWrapper(Boxed(None), sigma_m=lambda o, a: seen.append(a.shape) or np.zeros(1))
+    env.reset()
+    env.step((0.1, 0.2))
+    assert seen == [(1, 2)]
+
+
+def test_an_environment_that_writes_into_its_observation_does_not_change_the_last_one():
+    class InPlace(Says):
+        observation_space = S.Box(0, 99, (1,))
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.seen = np.zeros(1)
+            return self.seen, {}
+
+        def step(self, action):
+            self.seen += 1
+            return self.seen, *super().step(action)[1:]
+
+    steps = []
+    env = ReliabilityWrapper(InPlace(None), ratings=lambda o, a, n, r: steps.append((o.item(), n.item())) or r[:, None])
+    env.reset()
+    for _ in range(3):
+        env.step(0)
+    assert steps == [(0, 1), (1, 2), (2, 3)]
+
+
+# --- filtering twice ------------------------------------------------------------------------------------------------
+
+
+def test_a_wrapper_around_a_wrapper_is_refused():
+    def filtered():
+        return RecordEpisodeStatistics(ReliabilityWrapper(gymnasium.make(GRID, panel="main")))
+
+    for twice in (
+        lambda: ReliabilityWrapper(filtered()),
+        lambda: ReliabilityWrapper(SyncVectorEnv([filtered])),
+        lambda: ReliabilityWrapper(ReliabilityWrapper(SyncVectorEnv([lambda: Says(None)]))),
+    ):
+        with pytest.raises(InvalidValueError, match=r"^env = '.*ReliabilityWrapper': .*filtered twice"):
+            twice()
+
+
+def test_what_was_filtered_out_of_sight_is_refused_at_the_first_step():
+    class Hides(gymnasium.Env):  # no wrapper, as an environment in another process is none
+        def __init__(self):
+            self.inner = ReliabilityWrapper(Says([1.0, 2.0]))
+            self.observation_space, self.action_space = self.inner.observation_space, self.inner.action_space
+
+        def reset(self, *, seed=None, options=None):
+            return self.inner.reset(seed=seed)
+
+        def step(self, action):
+            return self.inner.step(action)
+
+    for env, action in ((Hides(), 0), (SyncVectorEnv([Hides]), np.zeros(1, int))):
+        outer = ReliabilityWrapper(env)
+        outer.reset()
+        with pytest.raises(InvalidValueError, match=r"^info\[\"raw_reward\"\] = .*filtered twice"):
+            outer.step(action)
+
+
+@pytest.mark.parametrize("given", [{"mitigation": Raw}, {"mitigation": "uard"}, {"abstention": 0.5}])
+def test_arguments_of_another_kind_are_named(given):
+    with pytest.raises(InvalidValueError, match=rf"^{next(iter(given))} = "):
+        ReliabilityWrapper(Says(None), **given)
+
+
+def test_the_ensemble_learns_nothing_from_what_is_no_number():
+    """One NaN would stay in its sums for ever."""
+    box, two = S.Box(-1, 1, (2,)), S.Discrete(2)
+    ensemble = RewardEnsemble(box, two)
+    state, action = np.zeros((1, 2)), np.zeros(1, int)
+    before = ensemble(state, action)
+    for bad in (
+        (np.full((1, 2), np.nan), action, np.ones(1)),
+        (state, action, np.array([np.nan])),
+        (state, action, np.array([1e200])),
+        (state, np.array([-1]), np.ones(1)),
+        (state, np.array([2]), np.ones(1)),
+        (state, np.array([0.5]), np.ones(1)),
+    ):
+        with pytest.raises(InvalidValueError):
+            ensemble.update(*bad)
+    assert ensemble(state, action) == before
+    for space in (S.Sequence(two), S.Graph(box, two)):
+        with pytest.raises(InvalidValueError, match=r"^action_space = .*: must be one whose samples"):
+            RewardEnsemble(box, space)
+    with pytest.raises(InvalidValueError, match=r"^seed = -1"):
+        RewardEnsemble(box, two, seed=-1)

@@ -9,7 +9,7 @@ import torch
 from sb3_contrib import TRPO
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
 import uard.envs  # noqa: F401 registers the ids
 from uard import InvalidValueError
@@ -175,14 +175,12 @@ def test_what_was_learned_is_saved_and_loaded(tmp_path):
     random = np.random.default_rng(0)
     for _ in range(100):
         env.step(random.integers(0, 4, 2))
-    env.save(tmp_path / "stream.pkl")
-    again = ReliabilityVecEnv.load(tmp_path / "stream.pkl", grids(2))
+    env.save(tmp_path / "stream.npz")
+    again = ReliabilityVecEnv.load(tmp_path / "stream.npz", grids(2))
     assert again.steps.stream.rated == 200
     assert again.steps.stream.mitigation == named("uard", lam=0.3)
     (tmp_path / "other.pkl").write_bytes(pickle.dumps([1]))
-    with pytest.raises(
-        InvalidValueError, match=r"path = .*other.pkl.*: must be a file that ReliabilityVecEnv.save wrote"
-    ):
+    with pytest.raises(InvalidValueError, match=r"path = .*other.pkl.*: must be a file that save wrote"):
         ReliabilityVecEnv.load(tmp_path / "other.pkl", grids(2))
 
 
@@ -235,3 +233,116 @@ def test_orders_that_cannot_be_meant():
         model.learn(32, callback=ReliabilityCallback())
     with pytest.raises(InvalidValueError, match="model = 'DQN': must be one with two critics or more"):
         CriticDisagreement(model)
+
+
+# --- filtering twice, other spaces, other precisions ----------------------------------------------------------------
+
+
+def wrapped_grid():
+    return ReliabilityWrapper(gymnasium.make(GRID, panel="main"))
+
+
+@pytest.mark.parametrize("venv", [DummyVecEnv, SubprocVecEnv])
+def test_a_vec_env_around_something_that_filters_is_refused(venv):
+    inner = venv([wrapped_grid])
+    try:
+        with pytest.raises(InvalidValueError, match=rf"^venv = '{venv.__name__}': .*filtered twice"):
+            ReliabilityVecEnv(inner)
+    finally:
+        inner.close()
+    with pytest.raises(InvalidValueError, match=r"^venv = 'ReliabilityVecEnv': .*filtered twice"):
+        ReliabilityVecEnv(VecNormalize(ReliabilityVecEnv(grids()), norm_obs=False, norm_reward=False))
+
+
+@pytest.mark.parametrize("env", [lambda: DummyVecEnv([wrapped_grid]), lambda: ReliabilityVecEnv(grids())])
+def test_a_buffer_behind_something_that_filters_is_refused_without_the_callback_too(env):
+    model = DQN("MlpPolicy", env(), replay_buffer_class=ReliabilityReplayBuffer, **small())
+    with pytest.raises(InvalidValueError, match=r"^infos\[0\]\['raw_reward'\] = .*filtered twice"):
+        model.learn(8)
+
+
+def test_a_vec_env_that_cannot_say_what_is_inside_is_found_out_at_the_first_step():
+    class Silent(VecMonitor):
+        def env_is_wrapped(self, wrapper_class, indices=None):
+            raise NotImplementedError
+
+    env = ReliabilityVecEnv(Silent(DummyVecEnv([wrapped_grid])))
+    env.reset()
+    with pytest.raises(InvalidValueError, match=r"^infos\[0\]\['raw_reward'\] = .*filtered twice"):
+        env.step(np.zeros(1, int))
+
+
+def test_an_environment_that_gives_one_info_again_and_again_is_not_taken_for_a_filtered_one():
+    class Same(gymnasium.Wrapper):
+        def step(self, action):
+            return *super().step(action)[:4], kept
+
+    kept = {"ratings": [1.0, 2.0]}
+    env = ReliabilityVecEnv(DummyVecEnv([lambda: Same(gymnasium.make(GRID))]))
+    env.reset()
+    for _ in range(3):
+        env.step(np.zeros(1, int))
+    assert "weight" not in kept
+
+
+def test_what_is_no_single_precision_number_reaches_no_algorithm():
+    """1e39 is a double and would be infinity in a network."""
+    high = [1e39, 1e39]
+    env = ReliabilityVecEnv(grids(), RatedReward(), ratings=lambda o, a, f, r: np.array([[1e39] * 3]))
+    env.reset()
+    with pytest.raises(InvalidValueError, match=r"^filtered reward\[0\] = 1e\+39: must be in .* it leaves as float32"):
+        env.step(np.zeros(1, int))
+    box = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+    one, done = np.zeros((1, 2), np.float32), np.zeros(1, bool)
+    buffer = ReliabilityReplayBuffer(4, box, box, mitigation=RatedReward())
+    with pytest.raises(InvalidValueError, match=r"^reward\[0\] = 1e\+39: must be in .* it leaves as float32"):
+        buffer.add(one, one, one, np.array([1e39]), done, [{}])
+    buffer.add(one, one, one, np.ones(1), done, [{"ratings": high}])
+    with pytest.raises(InvalidValueError, match=r"^filtered reward\[0\] = 1e\+39"):
+        buffer.sample(1)
+
+
+def test_observations_that_the_buffer_cannot_hold_are_named_before_training():
+    space = gymnasium.spaces.Dict({"a": gymnasium.spaces.Box(-1.0, 1.0, (2,))})
+    for options in ((4, space), (4,)):
+        with pytest.raises(InvalidValueError, match=r"^observation_space = Dict.*FlattenObservation"):
+            ReliabilityReplayBuffer(
+                *options, **{} if len(options) > 1 else {"observation_space": space}, action_space=space["a"]
+            )
+
+
+def test_the_places_of_a_buffers_steps_are_never_given_to_others():
+    box = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+    buffer = ReliabilityReplayBuffer(150_000, box, gymnasium.spaces.Discrete(2), key=lambda state, action: state)
+    assert buffer.steps.stream._max_keys == 150_000
+
+
+def test_a_step_before_the_first_reset_says_so():
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        ReliabilityVecEnv(grids()).step(np.zeros(1, int))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda m: ReliabilityVecEnv(grids(), m),
+        lambda m: ReliabilityReplayBuffer(8, gymnasium.spaces.Discrete(9), gymnasium.spaces.Discrete(4), mitigation=m),
+    ],
+)
+def test_a_class_is_no_mitigation(make):
+    with pytest.raises(InvalidValueError, match=r"^mitigation = <class .*: must be a Mitigation, not its class"):
+        make(Raw)
+
+
+def test_saving_again_leaves_the_old_file_whole_until_the_new_one_is(tmp_path):
+    path = tmp_path / "stream.npz"
+    env = ReliabilityVecEnv(grids())
+    env.reset()
+    env.step(np.array([1]))
+    env.save(path)
+    before = path.read_bytes()
+    env.steps.stream([1.0], [[1.0]], keys=[frozenset()])
+    with pytest.raises(InvalidValueError, match=r"^key = frozenset"):
+        env.save(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

@@ -331,3 +331,8 @@ def test_ratings_with_a_gradient_keep_it():
     ratings = torch.tensor([[-1.0, 2.0, 1.0]], requires_grad=True)
     aggregate(ratings, torch.zeros(1)).mean.sum().backward()
     assert ratings.grad.tolist() == [pytest.approx([1 / 3] * 3)]
+
+
+def test_thumbs_are_ratings_too():
+    feedback = aggregate(np.array([[True, False]]), np.array([1], np.int8))
+    assert (feedback.mean, feedback.lowest, feedback.proxy) == (0.5, 0.0, 1.0)

@@ -321,3 +321,43 @@ def test_docstring_examples_run():
     result = doctest.testmod(protocol)
     assert result.attempted > 0
     assert result.failed == 0
+
+
+def test_a_class_says_what_is_wrong_with_it_when_it_is_defined():
+    def signal(self, evidence, statistics):
+        return LearningSignal(evidence.reward, 1.0)
+
+    for name, value, message in (
+        ("acts_on", "nonsense", r"Own\.acts_on = 'nonsense': must be one of both, reward, score"),
+        ("backup", "gredy", r"Own\.backup = 'gredy': .*did you mean 'greedy'"),
+        (
+            "signal",
+            lambda self, reward: reward,
+            r"Own\.signal = '\(self, reward\)': must be \(self, evidence, statistics\)",
+        ),
+        ("fit", lambda self, ratings: (), r"Own\.fit = '\(self, ratings\)': must be \(self, feedback, rated\)"),
+        (
+            "score",
+            lambda self, mu, sigma_m, feedback, statistics: mu,
+            r"must be \(self, mu, .*\*, one_action=False\)",
+        ),
+    ):
+        with pytest.raises(InvalidValueError, match=message):
+            type("Own", (Mitigation,), {"signal": signal, name: value})
+    assert type("Own", (Mitigation,), {"signal": lambda self, *anything: None})
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: named("uard", kapa=1.0), r"^parameters of 'uard' = \{'kapa': 1.0\}: must be its fields .*'kapa'"),
+        (lambda: named("raw", k=1.0), "^parameters of 'raw'"),
+        (lambda: named(3), "^mitigation = 3: must be a name"),
+        (lambda: RewardDiscounting(filter=0.2), "^filter = 0.2: must be a ReliabilityFilter"),
+        (lambda: RewardDiscounting(standardise="false"), "^standardise = 'false': must be true or false"),
+        (lambda: RewardDiscounting(proxy_is_rater=1), "^proxy_is_rater = 1: must be true or false"),
+    ],
+)
+def test_parameters_of_another_kind_are_named(make, message):
+    with pytest.raises(InvalidValueError, match=message):
+        make()

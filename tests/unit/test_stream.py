@@ -1,13 +1,17 @@
+import io
+import json
+import math
 import pickle
 import warnings
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from uard import InvalidValueError
 from uard.method.abstention import Abstention
-from uard.method.mitigations import RatedReward, Raw, Screening, named, uard_paper
-from uard.ratings.stream import NeverRatedWarning, RewardStream
+from uard.method.mitigations import LearningSignal, Mitigation, RatedReward, Raw, Screening, named, uard_paper
+from uard.ratings.stream import KeysForgottenWarning, NeverRatedWarning, RewardStream
 
 TRAP = 4.0, (-1.0, 2.0, 1.0)
 HONEST = -0.1, (-0.1, -0.1, -0.1)
@@ -163,6 +167,20 @@ def test_it_says_once_that_nobody_ever_rated():
         ([1.0], {"sigma_m": [np.nan]}, r"sigma_m\[0\] = nan"),
         ([1.0], {"sigma_m": [1.0, 1.0]}, r"len\(sigma_m\) = 2: must be 1, one per reward"),
         ([1.0, 2.0], {"keys": ["a"]}, r"len\(keys\) = 1: must be 2, one per reward"),
+        ([1.0], {"keys": np.array(7)}, r"keys = array\(7\): must be a list of keys"),
+        ([1.0], {"keys": iter("a")}, "keys = <.*: must be a list of keys"),
+        ([1.0, 2.0], {"keys": "ab"}, "keys = 'ab': must be a list of keys"),
+        ([1.0], {"keys": {"a": 1}}, "keys = {'a': 1}: must be a list of keys"),
+        ([1.0, 2.0], {"keys": ["a", ["b"]]}, r"keys\[1\] = \['b'\]: must be hashable"),
+        ([1e200], {}, r"reward\[0\] = 1e\+200: must be in \[-1e\+100, 1e\+100\]"),
+        ([1.0], {"ratings": [[1e200]]}, r"ratings\[0, 0\] = 1e\+200"),
+        ([1.0], {"sigma_m": [1e200]}, r"sigma_m\[0\] = 1e\+200"),
+        ([1.0], {"ratings": [{17: 4.0}]}, r"ratings = \[\{17: 4.0\}\]: must be real numbers"),
+        (
+            [1.0],
+            {"ratings": np.zeros((1, 1001))},
+            r"ratings.shape = \(1, 1001\): must be \(1, K\) with K <= 1000",
+        ),
     ],
 )
 def test_bad_input_names_field_place_value_and_what_is_allowed(reward, more, message):
@@ -174,6 +192,10 @@ def test_bad_input_names_field_place_value_and_what_is_allowed(reward, more, mes
     ("options", "message"),
     [
         ({"mitigation": "uard"}, "mitigation = 'uard': must be a Mitigation"),
+        ({"mitigation": Raw}, "mitigation = <class .*Raw'>: must be a Mitigation, not its class or its name"),
+        ({"abstention": "threshold"}, "abstention = 'threshold': must be an Abstention"),
+        ({"max_keys": 0}, "max_keys = 0: must be a whole number >= 1"),
+        ({"seed": -1}, "seed = -1"),
         ({"mitigation": named("uard-paper")}, "mitigation.acts_on = 'score': must be 'reward'"),
         ({"ddof": 2}, "ddof = 2"),
         ({"capacity": 1}, "capacity = 1: must be a whole number >= 2"),
@@ -195,3 +217,225 @@ def test_a_mitigation_that_leaves_steps_out_is_refused_where_it_would():
 def test_a_printed_filter_with_another_lambda():
     out = told(RewardStream(uard_paper(lam=0.0, acts_on="reward")), [TRAP])
     assert out.reward == pytest.approx([4.0])
+
+
+# --- what is kept of keys -------------------------------------------------------------------------------------------
+
+
+def test_the_keys_that_came_longest_ago_are_forgotten_and_it_says_so_once():
+    stream = RewardStream(RatedReward("mean", unrated_weight=1.0), max_keys=2)
+    stream([0.0, 0.0], [[1.0], [2.0]], keys=["a", "b"])
+    stream([0.0], None, keys=["a"])  # so "b" came longest ago
+    with pytest.warns(KeysForgottenWarning, match="more than max_keys = 2 keys"):
+        stream([0.0], [[3.0]], keys=["c"])
+    assert stream([9.0, 9.0], None, keys=["a", "c"]).reward.tolist() == [1.0, 3.0]
+    out = stream([9.0], None, keys=["b"])  # a new one, which nobody has rated; "a" makes room
+    assert (out.reward, out.sigma_h) == (9.0, 0.0)
+    assert stream([9.0, 9.0], None, keys=["c", "b"]).reward.tolist() == [3.0, 9.0]
+    with pytest.raises(InvalidValueError, match=r"len\(keys\) = 3: must be at most max_keys = 2"):
+        stream(np.zeros(3), None, keys=["x", "y", "z"])
+
+
+@pytest.mark.filterwarnings("ignore::uard.ratings.stream.KeysForgottenWarning")
+def test_memory_is_bounded_however_many_keys_come():
+    stream = RewardStream(max_keys=100)
+    for i in range(60):
+        stream(np.zeros(50), np.zeros((50, 3)), keys=range(50 * i, 50 * i + 50))
+    assert len(stream._slots) == 100
+    assert stream._table.every().count.shape == (100,)
+
+
+def test_statistics_over_many_keys_are_measured_less_often():
+    measured = []
+
+    @dataclass(frozen=True)
+    class Counts(Raw):
+        def fit(self, feedback, rated):
+            measured.append(len(rated))
+
+    stream = RewardStream(Counts(), refresh=1, max_keys=10_000)
+    for i in range(2000):
+        stream([0.0], [[0.0]], keys=[i])
+    assert measured[:9] == [1, 2, 3, 4, 5, 6, 7, 8, 9]
+    assert len(measured) < 8 * (1 + math.log(2000 / 8)) + 8  # one measurement after every eighth
+    assert sum(measured) <= 9 * 2000
+
+
+def test_an_error_remembers_nothing():
+    stream = RewardStream()
+    for bad in ({"sigma_m": [-1.0]}, {"keys": [["unhashable"]]}, {"ratings": [[np.inf]]}):
+        with pytest.raises(InvalidValueError):
+            stream([1.0], **({"ratings": [[1.0]]} | bad))
+    assert (stream.rated, stream._steps, len(stream._sample.feedback().count)) == (0, 0, 0)
+
+
+# --- mitigations of others ------------------------------------------------------------------------------------------
+
+
+def giving(reward, **explanation):
+    """Return a mitigation that gives this reward, and whose explanation has these entries."""
+
+    class Other(Mitigation):
+        def signal(self, evidence, statistics):
+            return reward(evidence) if callable(reward) else reward
+
+        def explain(self, evidence, statistics):
+            return super().explain(evidence, statistics)._replace(**explanation)
+
+    return Other()
+
+
+@pytest.mark.parametrize(
+    ("mitigation", "message"),
+    [
+        (giving(lambda e: e.reward), r"^Other\.signal\(\.\.\.\) = array\(.*\): must be a LearningSignal"),
+        (
+            giving(LearningSignal(0.5, 1.0)),
+            r"^Other\.signal\(\.\.\.\)\.reward\.shape = \(\): must be \(2,\)",
+        ),
+        (
+            giving(LearningSignal(np.ones((2, 2)), 1.0)),
+            r"reward\.shape = \(2, 2\): must be \(2,\)",
+        ),
+        (giving(LearningSignal(np.array([1.0, np.nan]), 1.0)), r"^filtered reward\[1\] = nan: must be finite"),
+        (giving(LearningSignal(np.array(["1", "2"]), 1.0)), r"^Other\.signal\(\.\.\.\)\.reward\.dtype = dtype"),
+        (giving(LearningSignal(np.ones(2), 0.5)), "leaves steps out of learning"),
+        (
+            giving(LearningSignal(np.ones(2), 1.0), weight=np.ones((2, 1))),
+            r"\.weight\.shape = \(2, 1\): must",
+        ),
+        (
+            giving(LearningSignal(np.ones(2), 1.0), lam=np.nan),
+            r"^Other\.explain\(\.\.\.\)\[2, 0\] = nan: must",
+        ),
+    ],
+    ids=range(8),
+)
+def test_what_another_mitigation_gives_is_checked(mitigation, message):
+    with pytest.raises(InvalidValueError, match=message):
+        RewardStream(mitigation)([1.0, 2.0], [[1.0], [2.0]])
+
+
+# --- saved as data --------------------------------------------------------------------------------------------------
+
+KEYS = [0, -3, 2.5, math.inf, "text", b"\x00\xff", None, ("grid", (1, b"a"), True)]
+
+
+def keyed_stream(steps=40, **options):
+    stream, random = RewardStream(named("uard", lam=0.3), **options), np.random.default_rng(0)
+    for _ in range(steps):
+        stream(random.normal(size=8), random.normal(size=(8, 3)), keys=KEYS)
+        stream(random.normal(size=3), np.where(random.random((3, 2)) < 0.3, np.nan, 1.0))
+    return stream
+
+
+def test_what_was_saved_goes_on_exactly_as_the_stream_does(tmp_path):
+    stream = keyed_stream(abstention=Abstention("threshold", 0.5), capacity=20, refresh=64, max_keys=9)
+    stream.save(tmp_path / "stream.npz")
+    again = RewardStream.load(tmp_path / "stream.npz")
+    assert (again.mitigation, again.abstention) == (stream.mitigation, stream.abstention)
+    random = np.random.default_rng(1)
+    for i in range(30):
+        reward, ratings = random.normal(size=8), random.normal(size=(8, 4))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the tenth key makes one be forgotten, the same one in both
+            keys = [*KEYS[1:], i] if i % 2 else None
+            one, other = (s(reward, ratings, keys=keys) for s in (stream, again))
+        for mine, theirs in zip(one, other, strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+
+
+def test_a_mitigation_of_others_is_given_again(tmp_path):
+    path = tmp_path / "stream.npz"
+    RewardStream(giving(lambda e: LearningSignal(e.reward, 1.0))).save(path)
+    with pytest.raises(InvalidValueError, match="mitigation = None: must be given: the file's, Other, is not one of"):
+        RewardStream.load(path)
+    assert RewardStream.load(path, Raw()).mitigation == Raw()
+
+
+def test_a_key_that_cannot_be_written_is_named_and_the_old_file_stays_whole(tmp_path):
+    path = tmp_path / "stream.npz"
+    keyed_stream(2).save(path)
+    before, stream = path.read_bytes(), RewardStream()
+    stream([1.0], [[1.0]], keys=[frozenset({1})])
+    with pytest.raises(InvalidValueError, match=r"key = frozenset\(\{1\}\): must be a number, text, bytes"):
+        stream.save(path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["stream.npz"]
+
+
+class Executed:
+    def __reduce__(self):
+        return pytest.fail, ("the file was executed",)
+
+
+def saved_with(path, change):
+    """Save a stream, and change what is in its file: the JSON, and the arrays."""
+    keyed_stream(2).save(path)
+    with np.load(path) as file:
+        arrays = dict(file)
+    plain = json.loads(arrays.pop("plain").tobytes())
+    change(plain, arrays)
+    np.savez(path, plain=np.frombuffer(json.dumps(plain).encode(), np.uint8), **arrays)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda p, a: p.update(version=2),
+        lambda p, a: p.update(rated="many"),
+        lambda p, a: p.update(rated=-1),
+        lambda p, a: p.update(due=None),
+        lambda p, a: p.update(warned=1),
+        lambda p, a: p.update(max_keys=3),
+        lambda p, a: p.update(ddof=7),
+        lambda p, a: p.pop("capacity"),
+        lambda p, a: p.pop("mitigation"),
+        lambda p, a: p["mitigation"]["fields"].update(kappa="50"),
+        lambda p, a: p["mitigation"]["fields"].update(more=1),
+        lambda p, a: p.update(abstention={"rule": "nonsense"}),
+        lambda p, a: p["keys"].append(7),
+        lambda p, a: p["keys"].__setitem__(0, -3),
+        lambda p, a: p["chance"].update(seen=0),
+        lambda p, a: p["chance"]["random"].update(bit_generator="os.system"),
+        lambda p, a: p["chance"]["random"]["state"].update(state=-1),
+        lambda p, a: a.pop("table"),
+        lambda p, a: a.update(table=a["table"][:, :-1]),
+        lambda p, a: a.update(table=a["table"] * np.nan),
+        lambda p, a: a.update(table=-a["table"]),
+        lambda p, a: a.update(slots=a["slots"] * 0),
+        lambda p, a: a.update(sample=np.zeros((5000, 8))),
+    ],
+    ids=range(23),
+)
+def test_a_changed_file_is_named(tmp_path, change):
+    path = tmp_path / "stream.npz"
+    saved_with(path, change)
+    with pytest.raises(InvalidValueError, match=r"^path = '.*stream\.npz': must be a file that save wrote"):
+        RewardStream.load(path)
+
+
+def test_a_file_of_another_kind_is_named_and_never_executed(tmp_path):
+    path = tmp_path / "stream.npz"
+    keyed_stream(2).save(path)
+    whole, objects = path.read_bytes(), io.BytesIO()
+    np.savez(objects, plain=np.array([Executed()], object))
+    array = io.BytesIO()
+    np.save(array, np.zeros(3))
+    for content in (
+        pickle.dumps(Executed()),
+        objects.getvalue(),
+        array.getvalue(),
+        whole[:-40],
+        whole[:100],
+        b"",
+        b"{}",
+    ):
+        path.write_bytes(content)
+        with pytest.raises(
+            InvalidValueError, match=r"^path = '.*stream\.npz': must be a file that save wrote"
+        ) as caught:
+            RewardStream.load(path)
+        assert "allow_pickle" not in str(caught.value)
+    with pytest.raises(InvalidValueError, match="No such file"):
+        RewardStream.load(tmp_path / "absent.npz")

@@ -144,12 +144,15 @@ class ReliabilityWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.
         acted = batch_of(self.env.action_space, action) if self.steps.reads_steps else None
         next_observation, reward, terminated, truncated, info = super().step(action)
         refuse_filtered(info, 'info["raw_reward"]')
+        observed = _checks.as_numpy("reward", reward)
+        if observed.ndim:
+            raise _checks.InvalidValueError("reward.shape", observed.shape, "(), one number")
         reached = self._seen(next_observation)
         out = self.steps.filter(
             self._observation,
             acted,
             reached,
-            _checks.as_numpy("reward", [reward]),
+            observed[None],
             rows_of({0: info.get("ratings")}, 1),
         )
         filtered = float(out.reward[0])

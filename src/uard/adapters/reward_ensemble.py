@@ -54,11 +54,16 @@ class RewardEnsemble:
             features: Random features of each member, >= 1.
             ridge: Penalty > 0, in steps: how many it takes before data outweigh the prior.
             prior_scale: Deviation of the fixed random functions, in reward units, > 0.
-            seed: Of the features, the priors and the bootstrap.
+            seed: Of the features, the priors and the bootstrap, >= 0.
 
         Raises:
-            InvalidValueError: naming the argument, its value and what is allowed.
+            InvalidValueError: naming the argument, its value and what is allowed; a space of which a sample is no row
+                of numbers (``Sequence``, ``Graph``).
         """
+        for field, space in (("observation_space", observation_space), ("action_space", action_space)):
+            if not space.is_np_flattenable:
+                raise _checks.InvalidValueError(field, space, "one whose samples have a fixed number of numbers")
+        _checks.whole("seed", seed)
         _checks.whole("members", members, low=2, high=64)
         _checks.whole("features", features, low=1, high=4096)
         _checks.number("ridge", ridge, low=0, open_low=True)
@@ -75,7 +80,11 @@ class RewardEnsemble:
         self._seen, self._due = 0, 1
 
     def __call__(self, observations: Any, actions: Any) -> Float[np.ndarray, " B"]:
-        """Return sigma_m of a batch of state-actions of the two spaces, in reward units."""
+        """Return sigma_m of a batch of state-actions of the two spaces, in reward units.
+
+        Raises:
+            InvalidValueError: a state or an action is not finite, or none of its space's numbers.
+        """
         return uncertainty.sigma_model(self.predict(observations, actions), axis=0)
 
     def predict(self, observations: Any, actions: Any) -> Float[np.ndarray, "N B"]:
@@ -83,7 +92,12 @@ class RewardEnsemble:
         return np.einsum("nbf,nf->nb", self._features(observations, actions), self._prior + self._weights)
 
     def update(self, observations: Any, actions: Any, rewards: Float[np.ndarray, " B"]) -> None:
-        """Learn from a batch of steps; members are fitted again after 1, 2, 4 ... 256, 512, 768 ... steps."""
+        """Learn from a batch of steps; members are fitted again after 1, 2, 4 ... 256, 512, 768 ... steps.
+
+        Raises:
+            InvalidValueError: a state, an action or a reward is not finite: nothing is learned from the batch.
+        """
+        _checks.moderate("rewards", rewards)
         z = self._features(observations, actions)
         times = self._random.poisson(1.0, z.shape[:2]).astype(float)  # of each step in each member's bootstrap
         residual = rewards - np.einsum("nbf,nf->nb", z, self._prior)
@@ -97,6 +111,7 @@ class RewardEnsemble:
 
     def _features(self, observations: Any, actions: Any) -> Float[np.ndarray, "N B F"]:
         flat = np.concatenate([_flat(s, x) for s, x in zip(self._spaces, (observations, actions), strict=True)], axis=1)
+        _checks.finite("observations and actions", flat)
         projected = np.einsum("bw,nwf->nbf", flat, self._directions) * np.sqrt(flat.shape[1])
         return np.cos(projected + self._phases) * np.sqrt(2.0 / self._phases.shape[-1])
 
@@ -104,7 +119,10 @@ class RewardEnsemble:
 def _flat(space: gymnasium.Space[Any], batch: Any) -> Float[np.ndarray, "B width"]:
     """Return a batch as numbers of size about one."""
     if isinstance(space, gymnasium.spaces.Discrete):
-        return np.eye(int(space.n))[np.asarray(batch).reshape(-1) - int(space.start)]
+        numbers = np.asarray(batch).reshape(-1) - int(space.start)
+        if numbers.dtype.kind not in "iu" or numbers.min(initial=0) < 0 or numbers.max(initial=0) >= space.n:
+            raise _checks.InvalidValueError("batch", batch, f"whole numbers of {space}")
+        return np.eye(int(space.n))[numbers]
     if isinstance(space, gymnasium.spaces.Box):
         flat = np.asarray(batch, float).reshape(len(batch), -1)
         box = cast("Any", space)  # the precision of its bounds is not in its type

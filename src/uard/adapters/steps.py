@@ -206,6 +206,9 @@ def _ratings_row(field: str, entry: Any) -> Float[np.ndarray, " K"]:
 def refuse_filtered(info: Mapping[str, Any], field: str) -> None:
     """Refuse the ``info`` of a step that has been filtered already.
 
+    Examples:
+        >>> refuse_filtered({"ratings": [1.0], "weight": 70.0}, "info")
+
     Raises:
         InvalidValueError: all that this package puts into ``info`` is there.
     """
@@ -240,7 +243,13 @@ def batch_of(space: gymnasium.Space[Any], one: Any) -> Any:
 
 
 def arrays_of(space: gymnasium.Space[Any], batch: Any) -> Any:
-    """Return a batch as Gymnasium's vector environments have it, copied and with arrays only."""
+    """Return a batch as Gymnasium's vector environments have it, copied and with arrays only.
+
+    Examples:
+        >>> letters = gymnasium.spaces.Sequence(gymnasium.spaces.Discrete(2))
+        >>> arrays_of(letters, ((0, 1), (1,))).tolist()  # one sequence from each environment
+        [(0, 1), (1,)]
+    """
     spaces = gymnasium.spaces
     if isinstance(space, spaces.Dict):
         return {name: arrays_of(part, batch[name]) for name, part in cast("Any", space).spaces.items()}

@@ -15,12 +15,12 @@ from uard.method.arrays import Array, as_floats, namespace
 from uard.method.feedback import ByRater, Feedback
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Integer, Real
+    from jaxtyping import Bool, Float, Integer, Shaped
 
 
 def aggregate(
-    ratings: Real[Array, "*batch K"],
-    proxy: Float[Array, "*batch"],
+    ratings: Shaped[Array, "*batch K"],
+    proxy: Shaped[Array, "*batch"],
     mask: Bool[Array, "*batch K"] | None = None,
     ddof: int = 0,
 ) -> Feedback:
@@ -32,8 +32,9 @@ def aggregate(
         ([1.0, 0.0], [0.5, 0.0], [-1.0, 0.0], [2.0, 0.0])
 
     Args:
-        ratings: A column per rater, in reward units; stars and thumbs become floats. Without a mask NaN is a missing
-            rating; inside a JAX transformation, where NaN cannot be looked for, ratings without a mask are complete.
+        ratings: A column per rater, in reward units; stars and thumbs (truth values) become floats. Without a mask NaN
+            is a missing rating; inside a JAX transformation, where NaN cannot be looked for, ratings without a mask
+            are complete.
         proxy: The observed reward.
         mask: True where a rating exists; what is masked out may hold anything.
         ddof: Of the deviation, >= 0; a visit with no more ratings than that has a deviation of 0.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -28,7 +28,8 @@ def rollout(env: Any, steps: int = 1000, seed: int = 0) -> RatingLog:
         seed: Seed of the environment and of the actions, >= 0.
 
     Raises:
-        InvalidValueError: the number of ratings or what ``info`` holds changes from one step to another.
+        InvalidValueError: the number of ratings or what ``info`` holds changes from one step to another, or a reward is
+            no number.
     """
     _checks.whole("steps", steps, low=1)
     _checks.whole("seed", seed, low=0)
@@ -53,17 +54,30 @@ def _random_steps(env: Any, steps: int, seed: int) -> dict[str, list[Any]]:
     for _ in range(steps):
         action = env.action_space.sample()
         next_state, reward, terminated, truncated, info = env.step(action)
-        found = {"ratings": info.get("ratings"), "sigma_m": info.get("sigma_m")}
+        found = {"ratings": _with_nan(info.get("ratings")), "sigma_m": info.get("sigma_m")}
         found["true_reward"] = info["evaluation"].true_reward if "evaluation" in info else None
         whole = isinstance(state, int | np.integer) and isinstance(action, int | np.integer)
         found["item"] = f"state {state}, action {action}" if whole else None
-        for name, value in (found | {"reward": float(reward), "episode": episode, "step": step}).items():
+        for name, value in (found | {"reward": _one_number(step, reward), "episode": episode, "step": step}).items():
             columns[name].append(value)
         state, step = next_state, step + 1
         if terminated or truncated:
             state, _ = env.reset()
             episode, step = episode + 1, 0
     return columns
+
+
+def _with_nan(ratings: Any) -> Any:
+    """Return a list of ratings with NaN for None, where one is missing; what is no list as it is."""
+    listed = isinstance(ratings, list | tuple)
+    return [np.nan if x is None else x for x in cast("list[Any]", ratings)] if listed else ratings
+
+
+def _one_number(row: int, reward: Any) -> float:
+    try:
+        return float(_checks.as_numpy("reward", reward))
+    except (TypeError, ValueError):
+        raise bad_cell("rollout", row, "reward", reward, "one number") from None
 
 
 def _drop_absent(columns: dict[str, list[Any]]) -> dict[str, list[Any]]:

@@ -212,7 +212,7 @@ class RewardStream:
 
     def _places(self, keys: Sequence[Hashable], count: int) -> Int[np.ndarray, " B"]:
         """Return where ``count`` state-actions are kept; those that came longest ago make room for new ones."""
-        if isinstance(keys, str | bytes | Mapping) or not hasattr(keys, "__len__"):
+        if isinstance(keys, str | bytes | Mapping) or not np.iterable(keys) or not hasattr(keys, "__len__"):
             raise _checks.InvalidValueError("keys", keys, "a list of keys, one per reward")
         if len(keys) != count:
             raise _checks.InvalidValueError("len(keys)", len(keys), f"{count}, one per reward")
@@ -403,7 +403,7 @@ def _explained(mitigation: Mitigation, why: Any, zeros: Float[np.ndarray, " B"])
     out = _checks.as_numpy(f"{name}.signal(...).reward", signal.reward)
     if out.shape != zeros.shape:
         raise _checks.InvalidValueError(f"{name}.signal(...).reward.shape", out.shape, f"{zeros.shape}, one per step")
-    _checks.moderate("filtered reward", out)
+    _checks.finite("filtered reward", out)
     columns = [out]
     for field in ("weight", "sigma_h", "lam"):
         values = _checks.as_numpy(f"{name}.explain(...).{field}", getattr(why, field))

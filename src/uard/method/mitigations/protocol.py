@@ -10,8 +10,10 @@ import inspect
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
+import numpy as np
+
 from uard import _checks
-from uard.method.arrays import Array, Numbers, namespace
+from uard.method.arrays import Array, Numbers, as_floats, namespace
 from uard.method.feedback import Feedback
 
 if TYPE_CHECKING:
@@ -164,9 +166,18 @@ class Mitigation(ABC):
         return mu
 
     def explain(self, evidence: Evidence, statistics: Any) -> Explanation:
-        """Return what is learned and why; of a mitigation without weights, everything is believed as it is learned."""
+        """Return what is learned and why; of a mitigation without weights, everything is believed as it is learned.
+
+        Raises:
+            InvalidValueError: ``signal`` gave something else than a reward for each step.
+        """
         signal, feedback = self.signal(evidence, statistics), evidence.feedback
-        _checks.instance(f"{type(self).__name__}.signal(...)", signal, LearningSignal, "a LearningSignal")
+        name = f"{type(self).__name__}.signal(...)"
+        _checks.instance(name, signal, LearningSignal, "a LearningSignal")
+        shape, wanted = tuple(np.shape(signal.reward)), tuple(evidence.reward.shape)
+        if shape != wanted:
+            raise _checks.InvalidValueError(f"{name}.reward.shape", shape, f"{wanted}, one per step")
+        as_floats(f"{name}.reward", signal.reward)
         xp = namespace(evidence.reward, feedback.sd)
         zero = xp.zeros_like(evidence.reward)
         sigma_h = xp.where(feedback.count > 0, feedback.sd, zero)
