@@ -111,7 +111,7 @@ def test_columns(log, capsys):
         ("CartPole-v1 --set panel=main", "keyword of CartPole-v1 = 'panel': must be one of render_mode, "),
         (
             "uard/TrapGrid6-v0 --set size=5 --set size=6",
-            "--set = 'size=6': must be given once for each name: size has",
+            "--set = 'size=6': must be left out: size was set to 5 before",
         ),
         ("uard/TrapGrid6-v0 --by item", "--by = 'item': must be left out: it is for a file"),
         ("uard/TrapGrid6-v0 --reward score", "--reward = 'score': must be left out: it is for a file"),

@@ -67,11 +67,6 @@ class Quits(Raw):
             raise SystemExit(0)
 
 @dataclass(frozen=True)
-class Old(Mitigation):
-    def signal(self, reward, sigma_m, feedback):
-        return reward
-
-@dataclass(frozen=True)
 class Kindless(Environment):
     horizon: int = 5
 
@@ -110,6 +105,13 @@ def made_already(results):
     from uard.lab.views.sections import Section
     return [Section("made", "Made", 1, "<p>twice</p>")]
 """
+OLD = """
+from uard.method.mitigations import Mitigation
+
+class Old(Mitigation):
+    def signal(self, reward, sigma_m, feedback):
+        return reward
+"""
 ENTRIES = """
 [uard.mitigations]
 gone = no_such_module:Thing
@@ -117,7 +119,7 @@ missing = uard_broken:Nothing
 three = uard_broken:three
 raises = uard_broken:raises
 thawed = uard_broken:Thawed
-old = uard_broken:Old
+old = uard_old:Old
 exits = uard_broken:quits
 raw = uard_broken:Mine
 twice = uard_broken:Mine
@@ -177,6 +179,7 @@ def example(installed, monkeypatch):
 def broken(example, tmp_path, monkeypatch):
     """Beside the example, two packages of which nothing works."""
     (tmp_path / "uard_broken.py").write_text(BROKEN)
+    (tmp_path / "uard_old.py").write_text(OLD)
     distribution(tmp_path, "broken", ENTRIES)
     distribution(tmp_path, "other", "[uard.mitigations]\ntwice = uard_broken:Mine\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -219,7 +222,7 @@ def test_broken_ones_are_told_and_disturb_nobody(broken, capsys):
         "SystemExit: 0",
         "what it gives, Kindless(horizon=5), must be an Environment that declares its kind: tables, world, simulator",
         "what it gives, Unfamiliar(), must be an Agent that declares its family: tabular, replay, rollout",
-        "what it gives, Old(), must be a Mitigation whose signal can be called as every mitigation's is: signal(evi",
+        "Old.signal = '(self, reward, sigma_m, feedback)': must be (self, evidence, statistics)",
         "3 is no dictionary of groups, (Study, ...) by name",
         "the name of its study 'control' is taken",
         "the name of its group 'matrix' is that of a study",
@@ -237,7 +240,7 @@ def test_broken_ones_are_told_and_disturb_nobody(broken, capsys):
         ("three", "what it gives, 3, must be a frozen dataclass that is a Mitigation"),
         ("raises", "RuntimeError: not today"),
         ("exits", "SystemExit: 0"),
-        ("old", "what it gives, .*, must be a Mitigation whose signal can be called"),
+        ("old", r"Old\.signal = .*must be \(self, evidence, statistics\)"),
         ("thawed", "what it gives, .*Thawed.*, must be a frozen dataclass that is a Mitigation"),
         ("twice", "the name is also brought by other 1.0"),
     ],

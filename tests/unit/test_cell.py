@@ -150,12 +150,6 @@ class Typed(Mitigation):
 
 
 @dataclass(frozen=True)
-class OldSignature(Mitigation):
-    def signal(self, reward, sigma_m, feedback):
-        return LearningSignal(reward, 1.0)
-
-
-@dataclass(frozen=True)
 class NoKind(Environment):
     horizon: int = 5
 
@@ -261,10 +255,6 @@ def test_what_the_raters_do_does_not_matter_to_a_mitigation_that_asks_nobody(cha
         (
             {"mitigation": Raw},
             r"^mitigation = <class .*Raw'>: must be .*this is a class: Raw\(\.\.\.\) makes one",
-        ),
-        (
-            {"mitigation": OldSignature()},
-            r"^mitigation = .*must be a Mitigation whose signal can be .*: signal\(evi",
         ),
         ({"environment": NoKind()}, r"^environment = .*must be an Environment that declares its kind: tables, world, "),
         ({"agent": NoFamily()}, r"^agent = .*must be an Agent that declares its family: tabular, replay"),

@@ -217,8 +217,8 @@ def test_one_bad_cell_takes_no_other_of_its_batch_with_it(monkeypatch):
 
 
 def test_reading_makes_no_store(tmp_path):
-    for name in ("none.sqlite", "."):
-        with pytest.raises(StoreError, match="must be a result store, but there is no such file"):
+    for name, why in (("none.sqlite", "a result store, but there is no such file"), (".", "a file.*, not a folder")):
+        with pytest.raises(StoreError, match=f"must be {why}"):
             Store(tmp_path / name, readonly=True)
     (tmp_path / "empty").touch()
     with pytest.raises(StoreError, match="it is empty"):

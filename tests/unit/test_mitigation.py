@@ -222,7 +222,7 @@ def test_ablations_read_what_they_say(name, reads_sigma_m, reads_sigma_h):
 def test_named_mitigations_keep_the_contract(name):
     mitigation = named(name)
     assert isinstance(mitigation, Mitigation)
-    assert mitigation.reads_feedback is (name != "raw")
+    assert mitigation.reads_feedback is (name not in ("raw", "true-reward"))
     assert mitigation.backup == ("consistent" if name == "uard-consistent" else "greedy")
     assert mitigation == named(name)
     assert hash(mitigation) == hash(named(name))
@@ -353,7 +353,7 @@ def test_a_class_says_what_is_wrong_with_it_when_it_is_defined():
         (lambda: named("uard", kapa=1.0), r"^parameters of 'uard' = \{'kapa': 1.0\}: must be its fields .*'kapa'"),
         (lambda: named("raw", k=1.0), "^parameters of 'raw'"),
         (lambda: named(3), "^mitigation = 3: must be a name"),
-        (lambda: RewardDiscounting(filter=0.2), "^filter = 0.2: must be a ReliabilityFilter"),
+        (lambda: RewardDiscounting(filter=0.2), "^filter = 0.2: must be of the class ReliabilityFilter"),
         (lambda: RewardDiscounting(standardise="false"), "^standardise = 'false': must be true or false"),
         (lambda: RewardDiscounting(proxy_is_rater=1), "^proxy_is_rater = 1: must be true or false"),
     ],

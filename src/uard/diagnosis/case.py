@@ -268,7 +268,7 @@ def feedback_of(
     here = np.isfinite(ratings)
     if ratings.shape[1] == 0:
         ratings, here = np.zeros((len(reward), 1)), np.zeros((len(reward), 1), bool)
-    visits = aggregate(ratings, reward, here)
+    visits = aggregate(ratings, np.where(np.isnan(reward), 0.0, reward), here)._replace(proxy=reward)
     if item is None:
         return visits, visits
     distinct = by_item(visits, item)

@@ -23,6 +23,9 @@ ROUNDS = 5  # of Huber's iteration
 LOUDEST = 2.0  # times the median deviation: who is noisier is not heard, among three raters or more
 
 
+PER_RATER = ("noise", "bias", "idiosyncrasy", "heard")
+
+
 class RaterStatistics(NamedTuple):
     """Statistics of a panel of K raters, in reward units or their squares.
 
@@ -87,6 +90,29 @@ def fit(reward: Float[Array, " n"], by_rater: ByRater, rated: Bool[Array, " n"])
     return RaterStatistics(
         noise, bias, idiosyncrasy, xp.astype(quiet, sd.dtype), floor, masked_median(reward, rated), span, scale
     )
+
+
+def of_raters(statistics: RaterStatistics, raters: int) -> RaterStatistics:
+    """Return the statistics of the first raters; of one who was not there when they were measured, the usual ones.
+
+    Examples:
+        >>> import numpy as np
+        >>> one = fit(np.arange(5.0), ByRater(np.ones((5, 1)), np.ones((5, 1)), np.zeros((5, 1))), np.ones(5, bool))
+        >>> bool(of_raters(one, 3).noise[2] == one.noise[0]), of_raters(one, 3).bias[1:].tolist()
+        (True, [0.0, 0.0])
+
+    Args:
+        statistics: Of a panel.
+        raters: How many are there now.
+    """
+    known = statistics.noise.shape[0]
+    if known >= raters:
+        return statistics._replace(**{name: getattr(statistics, name)[:raters] for name in PER_RATER})
+    xp = namespace(statistics.noise)
+    one = xp.ones_like(statistics.noise[:1])
+    usual = {"noise": xp.mean(statistics.noise), "bias": 0.0, "idiosyncrasy": xp.mean(statistics.idiosyncrasy)}
+    more = {name: [usual.get(name, 1.0) * one] * (raters - known) for name in PER_RATER}
+    return statistics._replace(**{name: xp.concat([getattr(statistics, name), *more[name]]) for name in PER_RATER})
 
 
 def answer_variance(count: Float[Array, "n K"], m2: Float[Array, "n K"], scale: Numbers) -> Float[Array, " K"]:

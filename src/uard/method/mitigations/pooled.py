@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from uard import _checks
-from uard.method import pooled
+from uard.method import pooled, rater_statistics
 from uard.method.arrays import Array, namespace
 from uard.method.feedback import ByRater, Feedback
 from uard.method.mitigations.protocol import Evidence, Explanation, LearningSignal, Mitigation
@@ -106,7 +106,7 @@ class PooledDiscounting(Mitigation):
         self, r: Float[Array, "*batch"], each: ByRater, doubt: Float[Array, "*batch"], statistics: Believed
     ) -> tuple[Array, Array, Array, Array]:
         """Return what is learned, the weight, the anchor and tau."""
-        xp, raters = namespace(each.mean), statistics.raters
+        xp, raters = namespace(each.mean), rater_statistics.of_raters(statistics.raters, each.count.shape[-1])
         here = (each.count > 0) & (raters.heard > 0)
         said, variance = each.mean - raters.bias, pooled.errors(r, each, raters, self.slack)
         if self.vetoes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -74,15 +73,4 @@ def fault(value: object) -> str | None:
         >>> fault(named("raw")), fault(Raw)
         (None, 'a frozen dataclass that is a Mitigation, and this is a class: Raw(...) makes one')
     """
-    if (why := _checks.not_frozen(value, Mitigation)) is not None:
-        return why
-    for name in ("fit", "signal", "score", "explain", "without_prior"):
-        _, *wanted = inspect.signature(getattr(Mitigation, name)).parameters.values()
-        keywords = [p.name for p in wanted if p.kind is p.KEYWORD_ONLY]
-        positional = [p.name for p in wanted if p.name not in keywords]
-        try:
-            inspect.signature(getattr(value, name)).bind(*positional, **dict.fromkeys(keywords))
-        except (TypeError, ValueError):
-            call = ", ".join([*positional, *(f"{k}=..." for k in keywords)])
-            return f"a Mitigation whose {name} can be called as every mitigation's is: {name}({call})"
-    return None
+    return _checks.not_frozen(value, Mitigation)

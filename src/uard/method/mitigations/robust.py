@@ -94,6 +94,7 @@ class ExcessDisagreement(Mitigation):
     def signal(self, evidence: Evidence, statistics: RaterStatistics) -> LearningSignal:
         """Return the capped reward; unrated, the reward as far as it is usual."""
         each, r = each_rater(evidence.feedback), evidence.reward
+        statistics = rater_statistics.of_raters(statistics, each.count.shape[-1])
         here = (each.count > 0) & (statistics.heard > 0)
         variance = pooled.errors(r, each, statistics, slack=0.0)
         said = pooled.pool(r, each.mean - statistics.bias, here, variance, statistics.span)

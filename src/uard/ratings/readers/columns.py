@@ -55,9 +55,9 @@ class Wanted:
         Raises:
             InvalidValueError: naming the argument.
         """
-        for name in ("reward", "rater", "item", "rating", "by"):
+        for name in ("source", "reward", "rater", "item", "rating", "by"):
             value = getattr(self, name)
-            if not isinstance(value, str) and (value is not None or name == "reward"):
+            if not isinstance(value, str) and (value is not None or name in ("source", "reward")):
                 raise _checks.InvalidValueError(name, value, "the name of a column")
         if self.ratings is not None and (self.rater is not None or self.rating is not None):
             allowed = (
