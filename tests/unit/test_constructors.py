@@ -31,13 +31,8 @@ def configurations():
         if module.name.split(".")[1] in ("envs", "agents", "training", "lab", "method", "ratings"):
             for kind in vars(importlib.import_module(module.name)).values():
                 mine = isinstance(kind, type) and kind.__module__ == module.name and hasattr(kind, "__post_init__")
-                if (
-                    mine
-                    and getattr(kind, "__dataclass_params__", None)
-                    and kind.__dataclass_params__.frozen
-                    and not isabstract(kind)
-                    and kind.__name__ != "Ray"
-                ):
+                frozen = dataclasses.is_dataclass(kind) and kind.__dataclass_params__.frozen
+                if mine and frozen and not isabstract(kind) and kind.__name__ != "Ray":
                     yield kind
 
 
