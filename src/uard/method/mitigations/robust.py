@@ -32,6 +32,8 @@ class RaterCap(Mitigation):
         cap: Whether the reward is only capped by it: min(reward, statistic).
     """
 
+    asks_who: ClassVar[bool] = True
+
     statistic: Literal["mean", "median"] = "median"
     cap: bool = True
 
@@ -76,6 +78,7 @@ class ExcessDisagreement(Mitigation):
     """
 
     refits_early: ClassVar[bool] = True
+    asks_who: ClassVar[bool] = True
 
     k: float = 1.5
 
