@@ -164,8 +164,9 @@ class RatingSample:
             InvalidValueError: the rows, or how many were shown, are not what a sample may hold.
             KeyError, TypeError, ValueError: the random numbers' state is none.
         """
-        _checks.whole("seen", chance["seen"], low=len(rows))
-        _checks.whole("number of rows", len(rows), high=self._capacity)
+        _checks.whole("seen", chance["seen"])
+        if len(rows) != min(chance["seen"], self._capacity):
+            raise _checks.InvalidValueError("number of rows", len(rows), "as many as were seen, or can be kept")
         self._rows, self._seen = _Rows(rows), chance["seen"]
         self._random.bit_generator.state = chance["random"]
 

@@ -310,11 +310,19 @@ class RewardStream:
     def save(self, path: str | Path) -> None:
         """Write all that it knows to a file of arrays and JSON, for ``load``; the old file stays whole until then.
 
+        Raises:
+            InvalidValueError: as for ``state``.
+            OSError: the file cannot be written.
+        """
+        state.write(path, self.state())
+
+    def state(self) -> state.State:
+        """Return all that it knows as data, for ``restore``.
+
         The statistics are not in it: they are measured anew, here and there, so that both go on alike.
 
         Raises:
             InvalidValueError: a key is not made of numbers, text, bytes, truth values, None and tuples of such.
-            OSError: the file cannot be written.
         """
         rows = {"table": self._table.rows(len(self._slots)), "sample": self._sample.rows()}
         plain = {name: getattr(self, f"_{name}") for name in (*OPTIONS, *COUNTERS)}
@@ -323,8 +331,8 @@ class RewardStream:
         plain["abstention"] = None if self.abstention is None else state.described(self.abstention)["fields"]
         plain["keys"] = [state.plain_key(key) for key in self._slots]
         slots = np.fromiter(self._slots.values(), np.int64, len(self._slots))
-        state.write(path, state.State(plain, {**rows, "slots": slots}))
         self._statistics.clear()
+        return state.State(plain, {**rows, "slots": slots})
 
     @classmethod
     def load(cls, path: str | Path, mitigation: Mitigation | None = None) -> RewardStream:
@@ -361,12 +369,19 @@ class RewardStream:
             rule = None if plain["abstention"] is None else Abstention(**plain["abstention"])
             options = {name: plain[name] for name in OPTIONS}
             stream = cls(mitigation, abstention=rule, ddof=plain["ddof"], **options)
-            stream._restore(plain, arrays)
+            stream.restore(state.State(plain, arrays))
         except state.BROKEN as error:
             raise _checks.InvalidValueError("path", str(path), f"{allowed}: {error}") from None
         return stream
 
-    def _restore(self, plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    def restore(self, kept: state.State) -> None:
+        """Go on where the stream was whose ``state`` this is; it must have been built alike.
+
+        Raises:
+            InvalidValueError and others of ``uard.ratings.state.BROKEN``: it is no such state. The stream is then of no
+                use any more.
+        """
+        plain, arrays = kept
         for name in ("rated", "steps", "due"):
             _checks.whole(name, plain[name])
         for name in ("warned", "forgets"):

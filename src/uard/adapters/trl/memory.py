@@ -15,10 +15,8 @@ import numpy as np
 from uard import _checks
 from uard._support.files import replacing
 from uard.judges import Moments, Scale
-from uard.ratings.aggregate import empty_rows, from_rows
+from uard.ratings.state import BROKEN, State
 from uard.ratings.stream import RewardStream
-
-# pyright: reportPrivateUsage=false
 
 FORMAT = {"format": "uard reward for TRL", "version": 1}
 LARGEST_COUNT = 2**53  # numbers in a file; larger ones are no counts
@@ -111,7 +109,7 @@ class Memory:
         try:
             content = json.loads(Path(path).read_bytes(), parse_constant=_no_number)
             read = self._read(content)
-        except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        except (*BROKEN, LookupError, RecursionError) as error:
             what = f"one that a reward of judges {', '.join(self.tally.missing)} has saved, undamaged"
             why = f"{type(error).__name__}: {error}"
             raise _checks.InvalidValueError("file of a reward", str(path), f"{what} ({why})") from error
@@ -128,7 +126,7 @@ class Memory:
         if len(content["scales"]) != len(scales):
             raise _checks.InvalidValueError("number of scales", len(content["scales"]), str(len(scales)))
         *of_judges, members = [_to_scale(scale, kept) for scale, kept in zip(scales, content["scales"], strict=True)]
-        stream = _to_stream(self.stream, content["stream"], len(names))
+        stream = _to_stream(self.stream, content["stream"])
         return Memory(_to_tally(names, content["tally"]), of_judges, members, stream)
 
 
@@ -174,34 +172,13 @@ def _to_scale(scale: Scale, kept: Any) -> Scale:
 
 
 def _of_stream(stream: RewardStream) -> dict[str, Any]:
-    """Return what is kept of a stream; the statistics are measured anew, here and there, so that both go on alike."""
-    sample = stream._sample
-    stream._statistics.clear()
-    return {
-        "rows": sample._rows.values[: sample._rows.filled].tolist(),
-        "seen": sample._seen,
-        "random": sample._random.bit_generator.state,
-        "rated": stream.rated,
-        "steps": stream._steps,
-        "due": stream._due,
-    }
+    kept = stream.state()
+    arrays = {name: {"shape": x.shape, "data": x.ravel().tolist()} for name, x in kept.arrays.items()}
+    return {"plain": kept.plain, "arrays": arrays}
 
 
-def _to_stream(stream: RewardStream, kept: Any, judges: int) -> RewardStream:
+def _to_stream(stream: RewardStream, kept: Any) -> RewardStream:
     stream = copy.deepcopy(stream)
-    sample, raters = stream._sample, judges if kept["rows"] else 1
-    for name in ("seen", "rated", "steps", "due"):
-        _checks.whole(f"stream.{name}", kept[name], high=LARGEST_COUNT)
-    rows = np.array(kept["rows"], float).reshape(-1, empty_rows((0,), raters).shape[1])
-    _checks.finite("stream.rows", rows)
-    known = from_rows(rows)
-    assert known.by_rater is not None
-    for values in (known.count, known.sd, known.by_rater.count, known.by_rater.m2):
-        _checks.nonnegative("stream.rows", values)
-    if len(rows) != min(kept["seen"], sample._capacity):
-        raise _checks.InvalidValueError("len(stream.rows)", len(rows), "as many as were seen, or can be kept")
-    sample._rows.values, sample._rows.filled, sample._rows.raters = np.asfortranarray(rows), len(rows), raters
-    sample._seen, sample._random.bit_generator.state = kept["seen"], kept["random"]
-    stream.rated, stream._steps, stream._due = kept["rated"], kept["steps"], kept["due"]
-    stream._statistics.clear()
+    arrays = {name: np.array(x["data"]).reshape(x["shape"]) for name, x in kept["arrays"].items()}
+    stream.restore(State(kept["plain"], arrays))
     return stream
