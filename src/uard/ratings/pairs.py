@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
@@ -110,7 +110,7 @@ def residuals(ratings: Float[np.ndarray, "n K"], against: Float[np.ndarray, "n p
         rows = np.flatnonzero(known & np.isfinite(ratings[:, k]))
         if rows.size > design.shape[1]:
             x = ratings[rows, k]
-            line_of_rater: np.ndarray = np.linalg.lstsq(design[rows], x, rcond=None)[0]
-            error = x - design[rows] @ line_of_rater
+            line_of_rater = cast("np.ndarray", np.linalg.lstsq(design[rows], x, rcond=None)[0])  # untyped
+            error: np.ndarray = x - design[rows] @ line_of_rater
             left[rows, k] = np.where(np.abs(error).max() > 1e-9 * np.abs(x).max(), error, 0.0)
     return left
