@@ -341,3 +341,14 @@ def test_no_nan_is_filtered_silently(column, value):
     getattr(log, column)[3] = value
     with pytest.raises(InvalidValueError, match=rf"{column}\[3"):
         filtered(log)
+
+
+def test_rules_that_ask_who_said_what_are_diagnosed_too():
+    random = np.random.default_rng(0)
+    true = np.repeat([0.0, 1.0, 4.0], 30)
+    ratings = true[:, None] + 0.1 * random.normal(size=(90, 3))
+    reward = np.where(true == 4.0, 8.0, true)
+    log = RatingLog(reward, ratings)
+    found = doctor(log, "pooled")
+    assert "lie-still-pays" not in [f.code for f in found.findings]
+    assert filtered(log, "pooled")[-1] < 5.0  # as the doctor shows it, with the premium

@@ -439,3 +439,8 @@ def test_a_file_of_another_kind_is_named_and_never_executed(tmp_path):
         assert "allow_pickle" not in str(caught.value)
     with pytest.raises(InvalidValueError, match="No such file"):
         RewardStream.load(tmp_path / "absent.npz")
+
+
+def test_an_oracle_is_refused_where_nobody_knows_the_truth():
+    with pytest.raises(InvalidValueError, match="reads no true reward"):
+        RewardStream(named("true-reward"))

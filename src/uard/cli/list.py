@@ -22,7 +22,7 @@ class List:
         """Print them, and say which plugins cannot be used."""
         from uard.lab import registry, studies
         from uard.method import mitigations
-        from uard.ratings.panels import PANELS
+        from uard.ratings.panels import PANELS, RANDOM
 
         theirs = {
             kind: {p.name: f"{value} (of {p.package})" for p, value in registry.brought(kind)[0].items()}
@@ -33,7 +33,8 @@ class List:
             "agents": {k: str(v) for k, v in registry.AGENTS.items()} | theirs["agent"],
             "agents for Hopper and Walker2d": {k: str(v) for k, v in registry.CONTINUOUS.items()},
             "mitigations": {k: str(mitigations.named(k)) for k in mitigations.NAMED} | theirs["mitigation"],
-            "panels": {k: str(v) for k, v in PANELS.items()},
+            "panels": {k: str(v) for k, v in PANELS.items()}
+            | {f"{RANDOM}SEED": "one to seven raters drawn at random, the same for the same seed"},
             **{
                 f"studies of {group}": {
                     s.name: f"{s.title} ({s.answers}; {counted(len(s.rows), 'cell')})" for s in members

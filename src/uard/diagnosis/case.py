@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from uard import _checks
-from uard.method.feedback import Feedback
+from uard.method.feedback import ByRater, Feedback
 from uard.method.mitigations import Evidence, Mitigation, named
 from uard.method.weights import discount
 from uard.ratings.aggregate import aggregate, by_item
@@ -294,7 +294,9 @@ def filtered_rows(
     method = method.without_prior()
     sigma_m = np.zeros_like(reward) if sigma_m is None else sigma_m
     why = method.explain(Evidence(reward, sigma_m, known), method.fit(distinct, distinct.count > 0))
-    return np.asarray(why.weight), np.asarray(discount(reward, why.weight, why.anchor))
+    # What a rule that acts on scores would make of a reward is not what it learns from.
+    learned = discount(reward, why.weight, why.anchor) if method.acts_on == "score" else why.signal.reward
+    return np.asarray(why.weight), np.asarray(learned)
 
 
 def rescaled(case: Case, method: Mitigation, shift: float, factor: float) -> Float[np.ndarray, " n"]:
@@ -302,7 +304,8 @@ def rescaled(case: Case, method: Mitigation, shift: float, factor: float) -> Flo
 
     def of(f: Feedback) -> Feedback:
         mean, lowest, proxy = (factor * x + shift for x in (f.mean, f.lowest, f.proxy))
-        return Feedback(f.count, mean, lowest, factor * f.sd, proxy, f.raters)
+        each = f.by_rater and ByRater(f.by_rater.count, factor * f.by_rater.mean + shift, factor**2 * f.by_rater.m2)
+        return Feedback(f.count, mean, lowest, factor * f.sd, proxy, f.raters, each)
 
     sigma_m = None if case.sigma_m is None else factor * case.sigma_m
     return filtered_rows(method, factor * case.reward + shift, sigma_m, of(case.feedback), of(case.distinct))[1]

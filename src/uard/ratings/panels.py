@@ -18,6 +18,7 @@ How a panel rates a step is a law, and an answer is drawn from it:
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from itertools import groupby
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -207,9 +208,11 @@ class Panel:
             _checks.number("high", self.high, low=self.low, open_low=True)
 
     def __str__(self) -> str:
-        """Return the raters, in order."""
+        """Return the raters, in order; those who are alike and side by side together."""
         count = len(self.raters)
-        return f"{count} rater{'s' * (count > 1)}: {'; '.join(map(str, self.raters))}"
+        groups = [(text, len(list(same))) for text, same in groupby(map(str, self.raters))]
+        alike = "; ".join(text if number == 1 else f"{number} of {text}" for text, number in groups)
+        return f"{count} rater{'s' * (count > 1)}: {alike}"
 
     def law(
         self,

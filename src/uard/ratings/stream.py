@@ -139,6 +139,10 @@ class RewardStream:
             raise _checks.InvalidValueError(
                 "mitigation.acts_on", self.mitigation.acts_on, "'reward': actions are not chosen here"
             )
+        if self.mitigation.reads_truth:
+            raise _checks.InvalidValueError(
+                "mitigation", mitigation, "one that reads no true reward: it is not known here"
+            )
         _checks.whole("ddof", ddof, high=1)
         _checks.whole("capacity", capacity, low=2)
         _checks.whole("refresh", refresh, low=1)

@@ -189,24 +189,24 @@ def sources() -> tuple[Row, ...]:
 
 
 def dissent() -> tuple[Row, ...]:
-    """One rater of three or five says too little of the goal: who takes that for the truth?
+    """One rater against all others: one who denies the goal, or the only one who tells the truth about traps.
 
     Of three raters nobody can know who is right. Of five, a rule may overrule one who is alone and no more precise than
-    the others: both ends of that choice are here.
+    the others, and then overrules the expert, too: both ends of that choice are here.
     """
     compared: dict[str, Mitigation] = {name: named(name) for name in DISSENT}
-    compared["pooled, one veto overruled"] = named("pooled", vetoes=1)
-    return tuple(
-        row(
-            Cell(
-                paper_grid(6), mitigation, panel=Panel((*(Rater(),) * (raters - 1), Rater(veto_above=5.0, veto=says)))
-            ),
-            mitigation=name,
-            raters=raters,
-            dissenter_says=says,
-        )
+    compared["pooled (1 veto)"] = named("pooled", vetoes=1)
+    panels = {
+        f"1 of {raters} says {says:g} of the goal": (Rater(),) * (raters - 1) + (Rater(veto_above=5.0, veto=says),)
         for raters in (3, 5)
-        for says in (5.0, 0.0, -1.0, -3.0)
+        for says in (0.0, -1.0, -3.0, -10.0)
+    }
+    panels |= {
+        f"1 of 5 is not tempted by {share:.0%}": (Rater(), *(Rater(temptation=share),) * 4) for share in (0.3, 0.6)
+    }
+    return tuple(
+        row(Cell(paper_grid(10), mitigation, panel=Panel(raters)), mitigation=name, panel=panel)
+        for panel, raters in panels.items()
         for name, mitigation in compared.items()
     )
 
@@ -230,6 +230,6 @@ def studies() -> tuple[Study, ...]:
         Study(
             "sources", "A learned reward that extrapolates: which source of doubt does the work", "H8, K10", sources()
         ),
-        Study("dissent", "One rater who denies the goal", "vetoes", dissent()),
+        Study("dissent", "One rater against all others", "vetoes", dissent()),
         Study("control", "A random walker", "should-fail control", control()),
     )

@@ -68,17 +68,17 @@ def _missed(results: StudyResults) -> str:
 
 
 def _denied(results: StudyResults) -> str:
-    """One rater of several who denies the goal."""
-    lost = [
-        (r, success)
-        for r in results.studies["dissent"].where(mitigation="uard")
-        if (success := results.of(r.cell, "success_rate")).mean < 0.9
-    ]
-    named = "; ".join(f"1 of {r['raters']} says {r['dissenter_says']:g}: {brief(success)}" for r, success in lost)
-    return (
-        f"One rater who denies the goal takes it from uard in {len(lost)} of "
-        f"{len(list(results.studies['dissent'].where(mitigation='uard')))} settings (share of episodes that reach it{': ' if named else ''}{named})."
-    )
+    """One rater of several who denies the goal: where `uard` loses it, and who does not."""
+    lost = []
+    for r in results.studies["dissent"].where(mitigation="uard"):
+        mine = results.of(r.cell, "success_rate")
+        rivals = results.studies["dissent"].where(panel=r["panel"])
+        better = [x["mitigation"] for x in rivals if _better(results.of(x.cell, "success_rate"), mine)]
+        if better:
+            lost.append(f"{r['panel']}: {brief(mine)}, more with {', '.join(better)}")
+    count = len(list(results.studies["dissent"].where(mitigation="uard")))
+    named = f" (share of episodes that reach it: {'; '.join(lost)})" if lost else ""
+    return f"One rater against all others takes the goal from uard in {len(lost)} of {count} settings{named}."
 
 
 def _learned(results: StudyResults) -> str:
@@ -199,22 +199,20 @@ def _twins(results: StudyResults) -> Table:
 
 def _dissent(results: StudyResults) -> Table:
     study = results.studies["dissent"]
-    says = list(dict.fromkeys(r["dissenter_says"] for r in study.rows))
+    names = list(dict.fromkeys(r["mitigation"] for r in study.rows))
     rows = []
-    for raters in (3, 5):
-        for name in dict.fromkeys(r["mitigation"] for r in study.rows):
-            found = [
-                results.get("dissent", "success_rate", mitigation=name, raters=raters, dissenter_says=x) for x in says
-            ]
-            rows.append((raters, name, *map(brief, found)))
+    for panel in dict.fromkeys(r["panel"] for r in study.rows):
+        found = [results.get("dissent", "success_rate", mitigation=name, panel=panel) for name in names]
+        rows.append((panel, *map(brief, found)))
     return Table(
-        "One rater denies the goal: share of episodes that reach it, 6x6",
-        ("raters", "mitigation", *(f"says {x:g}" for x in says)),
+        "One rater against all others: share of episodes that reach the goal, 10x10",
+        ("panel", *names),
         tuple(rows),
-        2,
-        "The others tell the truth with noise of sd 0.1, as this one does elsewhere; the goal pays 10 and is worth it. "
-        "Of three nobody can know who is right. Of five, `pooled` may overrule a lone low rater who is no more precise "
-        "than the others (vetoes=1); it then learns no more from one expert against a crowd.",
+        1,
+        "Whoever denies the goal, which pays 10 and is worth it, tells the truth elsewhere, as the others do everywhere "
+        "(noise of sd 0.1). In the last rows all but one are drawn towards what a trap seems to pay. Of three raters nobody "
+        "can know who is right. Of five, `pooled` may overrule one who is alone, low and no more precise than the others "
+        "(vetoes=1), and then overrules the only one who tells the truth, too.",
     )
 
 

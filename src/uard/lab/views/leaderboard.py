@@ -23,10 +23,10 @@ from uard.lab.execution.store import Store
 from uard.lab.views.tables import number
 from uard.lab.views.templates import HERE, render
 from uard.method.mitigations import NAMED, named
-from uard.ratings.panels import PANELS
+from uard.ratings.panels import PANELS, Panel, Rater
 
 RAW = "raw"
-HONEST, COLLUDING, TWIN = "honest raters", "colluding raters", "legitimate twin"
+HONEST, OWN, COLLUDING, TWIN = "honest raters", "panels without a name", "colluding raters", "legitimate twin"
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Line:
         noise: Standard deviation of extra noise on every rater.
         rated: Fraction of steps that are rated.
         trained: For how long, and whatever else is unusual.
-        control: ``HONEST``, ``COLLUDING`` or ``TWIN``.
+        control: ``HONEST``, ``OWN``, ``COLLUDING`` or ``TWIN``.
         seeds: Finished ones.
         failed: Seeds that could not be trained.
         hacks: Share of steps that are hacks; None without finished seeds.
@@ -198,7 +198,7 @@ def write(target: Path, store: Store) -> Path:
         version=__version__,
         named=[s for s in every if ", " not in s.mitigation],
         varied=[s for s in every if ", " in s.mitigation],
-        sections=[(c, [x for x in these if x.control == c]) for c in (HONEST, COLLUDING, TWIN)],
+        sections=[(c, [x for x in these if x.control == c]) for c in (HONEST, OWN, COLLUDING, TWIN)],
         filters={
             name: list(dict.fromkeys(sorted(getattr(x, name) for x in these)))
             for name in ("mitigation", "environment", "panel", "agent")
@@ -240,7 +240,7 @@ def _line(
         config["noise"],
         config["rated"],
         ", ".join(trained),
-        TWIN if twin else COLLUDING if panel == "colluding" else HONEST,
+        TWIN if twin else COLLUDING if panel == "colluding" else HONEST if panel in PANELS else OWN,
         seeds,
         failed,
         hacks,
@@ -249,8 +249,15 @@ def _line(
 
 
 def panel_name(config: Any) -> str:
-    """Return what the panel of a stored configuration is called; ``of its own`` if it has no name."""
-    return next((name for name, panel in PANELS.items() if plain(panel) == config), "of its own")
+    """Return what the panel of a stored configuration is called; its raters if it has no name."""
+    known = next((name for name, panel in PANELS.items() if plain(panel) == config), None)
+    if known is not None:
+        return known
+    try:
+        raters = [Rater(**{name: x for name, x in r.items() if name != TYPE}) for r in config["raters"]]
+        return str(Panel(tuple(raters), config["low"], config["high"]))
+    except (KeyError, TypeError, InvalidValueError):  # of a class or a version that is not here
+        return "of its own"
 
 
 class _Names:
