@@ -554,3 +554,9 @@ def test_the_ensemble_learns_nothing_from_what_is_no_number():
             RewardEnsemble(box, space)
     with pytest.raises(InvalidValueError, match=r"^seed = -1"):
         RewardEnsemble(box, two, seed=-1)
+
+
+def test_rewards_in_normalised_units_are_refused():
+    env = gymnasium.wrappers.NormalizeReward(gymnasium.make("uard/TrapGrid6-v0", panel="main"))
+    with pytest.raises(InvalidValueError, match=r"env = 'NormalizeReward'.*normalised units"):
+        ReliabilityWrapper(gymnasium.wrappers.TimeLimit(env, 5))

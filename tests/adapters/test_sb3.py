@@ -346,3 +346,9 @@ def test_saving_again_leaves_the_old_file_whole_until_the_new_one_is(tmp_path):
         env.save(path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_rewards_in_normalised_units_are_refused():
+    venv = make_vec_env("uard/TrapGrid6-v0", 1, wrapper_class=gymnasium.wrappers.NormalizeReward)
+    with pytest.raises(InvalidValueError, match="normalised units"):
+        ReliabilityVecEnv(venv)

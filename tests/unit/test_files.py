@@ -157,3 +157,14 @@ def test_a_protected_file_is_not_replaced(tmp_path):
 def test_a_name_as_long_as_a_name_may_be(tmp_path):
     files.write(tmp_path / ("n" * 255), "x", "json")
     assert names(tmp_path) == ["n" * 255]
+
+
+def test_what_is_read_is_not_written_over_by_any_name(tmp_path):
+    store, link = tmp_path / "s.sqlite", tmp_path / "link"
+    store.write_text("all results")
+    link.symlink_to(store)
+    for path in (store, link, tmp_path / "." / "s.sqlite"):
+        with pytest.raises(InvalidValueError, match=r"json = .*another file than .*s.sqlite, which it would destroy"):
+            files.prepare(path, "json", None, store)
+    files.prepare(tmp_path / "other", "json", store, "no such file")
+    assert store.read_text() == "all results"

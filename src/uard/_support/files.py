@@ -82,16 +82,20 @@ def write(path: str | Path, text: str, field: str) -> None:
         raise InvalidValueError(field, str(path), f"a file that can be written ({error})") from None
 
 
-def prepare(path: str | Path, field: str) -> None:
+def prepare(path: str | Path, field: str, *read: str | Path | None) -> None:
     """Make a file's folder and refuse now, not after hours of work, what could not be written.
 
     Args:
         path: Of a file that is going to be written.
         field: What the path is called in the error.
+        read: Files that are read, or written to, by the same command; None is none.
 
     Raises:
-        InvalidValueError: it could not.
+        InvalidValueError: it could not, or it is one of those that are read, by whatever name.
     """
+    for other in read:
+        if other is not None and _is_same(path, other):
+            raise InvalidValueError(field, str(path), f"another file than {other}, which it would destroy")
     try:
         target, descriptor = _followed(os.fspath(path))
         if descriptor is not None:
@@ -106,6 +110,12 @@ def prepare(path: str | Path, field: str) -> None:
         _prepare_folder(os.path.dirname(target), str(path), field)
     if found is not None and not os.access(path, os.W_OK):
         raise InvalidValueError(field, str(path), "a file that can be written, and it is write-protected")
+
+
+def _is_same(path: str | Path, other: str | Path) -> bool:
+    with suppress(OSError, ValueError):  # of a name that is none
+        return os.path.isfile(path) and os.path.samefile(path, other)
+    return False
 
 
 def prepare_folder(path: str | Path, field: str) -> None:

@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Integer, Shaped
 
 
+NORMALISING = (gymnasium.wrappers.NormalizeReward, gymnasium.wrappers.vector.NormalizeReward)
+
+
 def _steps(
     env: Any,
     mitigation: Mitigation | None,
@@ -54,6 +57,9 @@ def _refuse_wrapped(env: Any) -> None:
     """Refuse environments in which rewards are filtered already, as far as that can be seen from outside."""
     if isinstance(env, ReliabilityWrapper | VectorReliabilityWrapper):
         allowed = "environments without one: rewards would be filtered twice"
+        raise _checks.InvalidValueError("env", type(env).__name__, allowed)
+    if isinstance(env, NORMALISING):
+        allowed = "one that goes outside, NormalizeReward(ReliabilityWrapper(env)): ratings are not in normalised units"
         raise _checks.InvalidValueError("env", type(env).__name__, allowed)
     if isinstance(env, gymnasium.Wrapper | gymnasium.vector.VectorWrapper):
         _refuse_wrapped(cast("Any", env).env)

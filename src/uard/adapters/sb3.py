@@ -213,6 +213,9 @@ def _refuse_changed(venv: Any) -> None:
         if any(venv.env_is_wrapped(ReliabilityWrapper)):
             allowed = "environments without a ReliabilityWrapper: rewards would be filtered twice"
             raise _checks.InvalidValueError("venv", type(venv).__name__, allowed)
+        if any(venv.env_is_wrapped(gymnasium.wrappers.NormalizeReward)):
+            allowed = "environments without NormalizeReward: ratings are not in normalised units"
+            raise _checks.InvalidValueError("venv", type(venv).__name__, allowed)
 
 
 class ReliabilityReplayBuffer(ReplayBuffer):

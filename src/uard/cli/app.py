@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 import sys
 import traceback
@@ -33,7 +34,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     try:
         with signals.ending():
             _run(arguments)
-            sys.stdout.flush()
+            if sys.stdout is not None:  # its reader may have closed it from the start
+                sys.stdout.flush()
     except BaseException as error:
         if signals.received() is None and not isinstance(error, KeyboardInterrupt):
             _end(error)
@@ -48,6 +50,9 @@ def _end(error: BaseException) -> None:
     if isinstance(error, BrokenPipeError):
         signals.quiet_output()
         sys.exit(1)
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        signals.quiet_output()
+        sys.exit(f"error: the output cannot be written ({error.strerror})")
     if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] in _OF_LAB:
         sys.exit(f"the laboratory is not installed: pip install 'uard[lab]' ({error})")
 

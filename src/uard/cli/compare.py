@@ -35,7 +35,7 @@ class Compare:
         from uard.lab.execution.store import Store
         from uard.lab.views import compare
 
-        terminal.check_json(self.json)
+        terminal.check_json(self.json, self.store_a, self.store_b)
         with (
             closing(Store(self.store_a, readonly=True)) as a,
             closing(Store(self.store_b, readonly=True)) as b,

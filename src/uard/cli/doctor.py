@@ -69,7 +69,7 @@ class Doctor:
         """Read or roll out the log, and print what was found."""
         from uard import doctor
 
-        terminal.check_json(self.json)
+        terminal.check_json(self.json, self.log)
         mitigation: Any = self.mitigation
         if self.set_mitigation:
             mitigation = mitigation_named(mitigation, read(self.set_mitigation, "--set-mitigation"))

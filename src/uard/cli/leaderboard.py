@@ -35,7 +35,7 @@ class Leaderboard:
         if not os.path.isfile(self.store):  # Path's raises for a long name
             allowed = "a file that is there; `uard reproduce` and `uard run --store` make one"
             raise InvalidValueError("store", self.store, allowed)
-        files.prepare(self.out, "out")
+        files.prepare(self.out, "out", self.store)
         with closing(Store(self.store, readonly=True)) as store:
             written = leaderboard.write(Path(self.out), store)
             for line in said_of_damaged(store.damaged):

@@ -28,7 +28,7 @@ class Preferences:
         """Read the file and print the counts."""
         from uard.ratings import preferences
 
-        terminal.check_json(self.json)
+        terminal.check_json(self.json, self.file)
         found = preferences.read(self.file)
         counts = {
             "comparisons": len(found),

@@ -112,7 +112,7 @@ class Reproduce:
             raise InvalidValueError("report", self.report, "left out unless all grid studies are run")
         if self.report is not None:
             files.prepare_folder(self.report, "report")
-        terminal.check_json(self.extract, "extract")
+        terminal.check_json(self.extract, self.store, field="extract")
         for name, given in (("report", self.report), ("extract", self.extract)):
             if self.failed and given is not None:
                 raise InvalidValueError(name, given, "left out with --failed, which runs a part only")

@@ -72,7 +72,7 @@ class Run:
         from uard.lab.study import results_of
 
         _checks.whole("seeds", self.seeds, low=1, high=100_000)
-        terminal.check_json(self.json)
+        terminal.check_json(self.json, self.store)
         cell, trap_reward = self._cell()
         store = Store(":memory:" if self.store is None else self.store)
         seeds = range(self.seeds)

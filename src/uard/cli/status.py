@@ -42,7 +42,7 @@ class Status:
 
         if self.seeds is not None:
             _checks.whole("seeds", self.seeds, low=1, high=100_000)
-        terminal.check_json(self.json)
+        terminal.check_json(self.json, self.store)
         chosen = studies.find(self.studies) if self.studies else studies.every()
         with closing(Store(self.store, readonly=True)) as store:
             found = status.status(store, chosen, self.seeds, every=bool(self.studies))

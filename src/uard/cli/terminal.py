@@ -133,14 +133,14 @@ def write_json(data: Any, target: str, field: str = "json", indent: int | None =
         files.write(target, text + "\n", field)
 
 
-def check_json(target: str | None, field: str = "json") -> None:
-    """Refuse before the work, not after it, what cannot be written.
+def check_json(target: str | None, *read: str | None, field: str = "json") -> None:
+    """Refuse before the work, not after it, what cannot be written, and to write over what is read.
 
     Raises:
         InvalidValueError: so it is.
     """
     if target is not None and target != "-":
-        files.prepare(target, field)
+        files.prepare(target, field, *read)
 
 
 def check_workers(workers: int | None) -> None:

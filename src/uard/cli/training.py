@@ -80,7 +80,7 @@ def train(
         events = Events(watch.tensorboard, titles(studies))
         events.catch_up(store, jobs)
     try:
-        with _logging(watch), progress.bar(console, what) as move:
+        with _logging(watch, store.path), progress.bar(console, what) as move:
             trained = runner.run(jobs, store, workers, move, events.write if events else None, engine)
     except runner.StudyFailedError as failed:
         _tell(failed, titles(studies), console)
@@ -107,7 +107,7 @@ def _tell(failed: StudyFailedError, names: dict[str, str], console: Console) -> 
 
 
 @contextmanager
-def _logging(watch: Watch) -> Iterator[None]:
+def _logging(watch: Watch, store: str) -> Iterator[None]:
     """Append to the file what the library logs, as long as the block runs."""
     import logging
     import time
@@ -115,7 +115,7 @@ def _logging(watch: Watch) -> Iterator[None]:
     if watch.log is None:
         yield
         return
-    files.prepare(watch.log, "log")
+    files.prepare(watch.log, "log", store)
     try:
         handler = logging.FileHandler(watch.log, encoding="utf-8")
     except OSError as wrong:

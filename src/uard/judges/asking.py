@@ -225,7 +225,7 @@ class _Naming:
         return
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, Exception):
+        if isinstance(error, Exception | SystemExit):  # a judge must not end a training as if all were well
             raise JudgeError(f"{self._judge}: {type(error).__name__}: {error}") from error
 
 

@@ -24,14 +24,14 @@ def rollout(env: Any, steps: int = 1000, seed: int = 0) -> RatingLog:
 
     Args:
         env: A ``gymnasium.Env``; it is not closed.
-        steps: Number of steps, >= 1.
+        steps: Number of steps, in 1..10 000 000.
         seed: Seed of the environment and of the actions, >= 0.
 
     Raises:
         InvalidValueError: the number of ratings or what ``info`` holds changes from one step to another, or a reward is
             no number.
     """
-    _checks.whole("steps", steps, low=1)
+    _checks.whole("steps", steps, low=1, high=10_000_000)
     _checks.whole("seed", seed, low=0)
     columns = _drop_absent(_random_steps(env, steps, seed))
     widths = [np.shape(v) for v in columns.get("ratings", ())]

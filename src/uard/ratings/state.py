@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import zipfile
+import zlib
 from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -16,7 +17,10 @@ from uard._support import fields, files
 from uard.method.mitigations import NAMED, Mitigation
 
 VERSION = 1
-BROKEN = (OSError, EOFError, zipfile.BadZipFile, AttributeError, KeyError, OverflowError, TypeError, ValueError)
+BROKEN = (
+    *(OSError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError, AttributeError, LookupError, OverflowError),
+    *(MemoryError, TypeError, ValueError),
+)
 """What reading a file of another kind, a truncated or a changed one may raise."""
 
 

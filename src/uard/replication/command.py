@@ -45,7 +45,7 @@ class Ledger:
 
         _checks.whole("seeds", self.seeds, low=2, high=100_000)
         terminal.check_workers(self.workers)
-        terminal.check_json(self.json)
+        terminal.check_json(self.json, self.store)
         for claim in self.claims:
             _checks.choose("claim", claim, ledger.CLAIMS)
         store, seeds, grid = Store(self.store), range(self.seeds), studies.grid()

@@ -79,7 +79,7 @@ class PooledDiscounting(Mitigation):
         if self.lies == 1:
             raise _checks.InvalidValueError("lies", self.lies, "less than 1: a reward that always lies teaches nothing")
         for name in ("slack", "contest", "caution", "risk"):
-            _checks.number(name, getattr(self, name), low=0)
+            _checks.number(name, getattr(self, name), low=0, high=1000)
         _checks.number("unrated_weight", self.unrated_weight, low=0, high=1)
         _checks.whole("vetoes", self.vetoes, high=30)
 
