@@ -807,3 +807,17 @@ def test_raters_are_checked_without_rewards(spoilt, code):
     found = doctor(columns | {"rating": np.concatenate([a, b, spoilt(c, b)])})
     assert [f.code for f in found.findings] == [*([code] if code else []), "no-rewards"]
     json.dumps(found.as_data(), allow_nan=False)
+
+
+def test_the_number_or_time_of_a_rating_is_no_rating(tmp_path):
+    for about in ("rating_id", "rating_time", "Rating Count"):
+        file = tmp_path / "log.csv"
+        file.write_text(f"item,worker,{about},score\na,u,101,5\na,v,102,1\n")
+        assert logs.read(file).ratings.tolist() == [[5.0, 1.0]]
+
+
+def test_a_missing_time_is_before_all_others_and_compact_dates_are_dates(tmp_path):
+    file = tmp_path / "log.csv"
+    for last, kept in (("nan", 5.0), ("20260105", 1.0), ("20260101", 5.0)):
+        file.write_text(f"item,worker,score,created_at\na,u,5,2026-01-02\na,u,1,{last}\na,v,3,\n")
+        assert logs.read(file).ratings.tolist() == [[kept, 3.0]]

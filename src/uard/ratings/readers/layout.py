@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -197,10 +198,18 @@ def ratings_among(names: Iterable[str], but: Sequence[str | None]) -> dict[str, 
         schema, parted, _ = name.partition(SCHEMA)
         if parted and schema != "span_annotation":
             found.setdefault(schema, []).append(name)
-        elif name not in but and not parted and (normal(name) in VALUES or normal(name).startswith("rating")):
+        elif name not in but and not parted and (normal(name) in VALUES or _is_rating(name)):
             found[name] = [name]
-    called_so = [name for name in found if normal(name).startswith("rating")]
+    called_so = [name for name in found if _is_rating(name)]
     return {called_so[0]: found[called_so[0]]} if len(called_so) == 1 else found
+
+
+def _is_rating(name: str) -> bool:
+    """Whether a column is called after a rating itself, not after its number or time."""
+    return normal(name).startswith("rating") and not _ABOUT.search(name.casefold())
+
+
+_ABOUT = re.compile(r"[\W_](id|at|on|time|date|timestamp|seconds|duration|count|number|comment|reason)$")
 
 
 def _others(names: Sequence[str], taken: Sequence[str | None]) -> tuple[tuple[str, ...], tuple[str, ...]]:

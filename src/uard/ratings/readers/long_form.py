@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ import numpy as np
 
 from uard import _checks
 from uard.ratings.log import RatingLog, Repeats, bad_cell
-from uard.ratings.readers.columns import Numbers, name_of
+from uard.ratings.readers.columns import MISSING, Numbers, name_of
 from uard.ratings.readers.layout import Layout
 
 if TYPE_CHECKING:
@@ -114,10 +115,12 @@ def _times(cells: Sequence[Any], rows: Integer[np.ndarray, " n"], column: str, s
 
 
 def _time(cell: Any, row: int, column: str, source: str) -> float:
-    if cell is None or cell != cell or cell == "":
+    if cell is None or cell != cell or (isinstance(cell, str) and cell.strip().lower() in MISSING):
         return -np.inf
+    is_date = isinstance(cell, str) and re.fullmatch(r"(19|20)\d{6}", cell.strip()) is not None  # not so many seconds
     try:
-        return float(cell) if not isinstance(cell, datetime) else _seconds(cell)
+        if not is_date:
+            return float(cell) if not isinstance(cell, datetime) else _seconds(cell)
     except (TypeError, ValueError, OverflowError):
         pass
     try:

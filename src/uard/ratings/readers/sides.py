@@ -44,8 +44,8 @@ def sides_among(names: Sequence[str]) -> Sides | None:
     """
     if (kept := among(names, ("chosen",))) and (lost := among(names, ("rejected",))):
         return Sides(kept[0], lost[0], None)
-    for one, other in SIDES:
-        choice = next((n for c in CHOICES for n in among(names, (c,))), None)
-        if (first := among(names, (one,))) and (second := among(names, (other,))) and choice is not None:
+    choice = next((n for c in CHOICES for n in among(names, (c,))), None) if among(names, CHOICES) else None
+    for one, other in SIDES if choice is not None else ():
+        if (first := among(names, (one,))) and (second := among(names, (other,))):
             return Sides(first[0], second[0], choice)
     return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
+from functools import lru_cache
 
 TIMES = (
     "updatedat", "submittedat", "completedat", "createdat", "timestamp", "datetime", "date", "time",
@@ -11,6 +12,7 @@ TIMES = (
 """Columns that say when; the first that is there counts."""
 
 
+@lru_cache(maxsize=1 << 16)  # a log may have thousands of columns, and many lists of names are gone through
 def normal(name: str) -> str:
     """Return a name without case, spaces and punctuation.
 
