@@ -821,3 +821,10 @@ def test_a_missing_time_is_before_all_others_and_compact_dates_are_dates(tmp_pat
     for last, kept in (("nan", 5.0), ("20260105", 1.0), ("20260101", 5.0)):
         file.write_text(f"item,worker,score,created_at\na,u,5,2026-01-02\na,u,1,{last}\na,v,3,\n")
         assert logs.read(file).ratings.tolist() == [[kept, 3.0]]
+
+
+def test_a_list_and_a_part_of_it_are_one_column_too_many(tmp_path):
+    file = tmp_path / "log.jsonl"
+    file.write_text('{"reward":1,"rating":[1,2],"rating[0]":9}\n{"reward":1,"rating":[1,2]}\n')
+    with pytest.raises(InvalidValueError, match=r"row 1, column = 'rating\[0\]': must be there only once"):
+        logs.read(file)

@@ -102,6 +102,8 @@ def _columns(
 
     def put(name: str, cells: list[Any]) -> None:
         column = columns.setdefault(name, [])
+        if len(column) > count:  # a list, and beside it what is called as a part of it
+            raise _checks.InvalidValueError(f"row {count + 1}, column", name, "there only once")
         if len(column) < count:
             gaps.setdefault(name, len(column))
             column.extend([None] * (count - len(column)))
