@@ -122,14 +122,14 @@ class Diagnosis:
         """Return the whole diagnosis as text, 100 columns wide."""
         who = f"{len(self.raters)} rater{'s' * (len(self.raters) != 1)}"
         names = f" ({', '.join(self.raters)})" if 0 < len(self.raters) <= 8 else ""
-        lines = [f"{self.source}: {self.rows} rows, {who}{names}, {percent(self.rated)} of rows rated"]
+        lines = [f"{self.source}: {row_count(self.rows)}, {who}{names}, {percent(self.rated)} of rows rated"]
         alpha = "not defined (fewer than two ratings of anything, or all ratings equal)"
         if self.agreement is not None:
             between = interval(*self.agreement_interval or (None, None))
-            alpha = f"{self.agreement:.3f} ({between}1 perfect, 0 chance; below 0.667 by custom too low to rely on)"
+            alpha = f"{self.agreement:z.3f} ({between}1 perfect, 0 chance; below 0.667 by custom too low to rely on)"
         lines.append(f"agreement   Krippendorff's alpha {alpha}")
         for s in self.strata:
-            alpha = "not defined" if s.agreement is None else f"{s.agreement:.3f}"
+            alpha = "not defined" if s.agreement is None else f"{s.agreement:z.3f}"
             lines.append(f"            within {s.name}: {alpha} ({interval(s.low, s.high)}{row_count(s.rows)})")
         if (i := self.independence) is not None:
             errors = "their errors" if i.against == "true_reward" else "what the reward misses, error or truth,"

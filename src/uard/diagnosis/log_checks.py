@@ -83,9 +83,11 @@ def missing_ratings(case: Case) -> Finding | None:
     per_rater = 1.0 - here.mean(0)
     worst = int(per_rater.argmax())
     missing, none = float(1.0 - here.mean()), int((here.sum(1) == 0).sum())
+    one = per_rater[worst] > 1.5 * missing  # where all miss alike, no rater is to blame
+    whose = f"most of {case.log.raters[worst]} ({percent(per_rater[worst])})" if one else "no rater stands out"
     evidence = (
-        f"{percent(missing)} of ratings are missing; most of {case.log.raters[worst]} ({percent(per_rater[worst])}). "
-        f"{row_count(none)} have none at all"
+        f"{percent(missing)} of ratings are missing; {whose}. "
+        f"{row_count(none)} {'has' if none == 1 else 'have'} none at all"
     )
     numbers = {"missing": missing, "unrated_rows": float(none)}
     numbers |= {f"missing_{name}": float(x) for name, x in zip(case.log.raters, per_rater, strict=True)}
@@ -103,7 +105,7 @@ def missing_ratings(case: Case) -> Finding | None:
         evidence + ".",
         "A NaN that is averaged makes sigma_h and the anchor NaN; with fewer raters on a row sigma_h is smaller, so gaps look "
         "like agreement; and a lie that nobody rated is hardly doubted.",
-        "Pass a mask: sigma_human(ratings, mask=np.isfinite(ratings), empty=...); ask the missing rater again.",
+        "Pass a mask: sigma_human(ratings, mask=np.isfinite(ratings), empty=...); ask for the missing ratings.",
         numbers,
     )
 

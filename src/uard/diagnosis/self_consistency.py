@@ -35,7 +35,7 @@ def self_consistency(case: Case) -> Finding | None:
     if not own.size:
         return None
     numbers = {"repeats": float(own.size), "own_difference": float(own.mean())}
-    evidence = f"{own.size} times a rater has answered again; the answers differ by {own.mean():.3g} on average"
+    evidence = f"{own.size} time{'s' * (own.size != 1)} a rater has answered again; the answers differ by {own.mean():.3g} on average"
     worst: list[str] = []
     if between is not None:
         numbers["difference_between_raters"] = between

@@ -64,11 +64,27 @@ class Wanted:
                 "left out where rater or rating names a column: either each rater has a column, or each row a rater"
             )
             raise _checks.InvalidValueError("ratings", self.ratings, allowed)
+        self._check_roles()
         called_so = self.ratings is None and self.by is not None and self.by.startswith("rating")
         if self.by is not None and (
             called_so or self.by in (self.reward, self.rating, *NUMBERS, *(self.ratings or ()))
         ):
             raise _checks.InvalidValueError("by", self.by, "a column that is neither the reward, a sigma nor a rating")
+
+    def _check_roles(self) -> None:
+        """Refuse a column that is named for two roles, or twice among the ratings; ``by`` may be item or rater.
+
+        Raises:
+            InvalidValueError: naming the later role.
+        """
+        roles: dict[str, str] = {}
+        single = (("reward", self.reward), ("rater", self.rater), ("item", self.item))  # rating may name a question
+        for role, name in (*single, *(("ratings", name) for name in self.ratings or ())):
+            if name is None:
+                continue
+            if name in roles:
+                raise _checks.InvalidValueError(role, name, f"a column that is not already named as {roles[name]}")
+            roles[name] = role
 
 
 class Choice(ABC):

@@ -176,10 +176,15 @@ def _long(names: Sequence[str], raters: Sequence[str], wanted: Wanted) -> Layout
     rater = wanted.rater or _one(raters, names, "says who rated", f"name it with rater (--rater); {wide}", wanted)
     items = among(names, ITEMS, but=(rater, wanted.rating, reward)) or among(names, ("id",), but=(rater, reward))
     item = wanted.item or _one(items, names, "says what was rated", f"name it with item (--item); {wide}", wanted)
+    if item == rater:
+        raise _checks.InvalidValueError("item", item, "a column that is not already the rater")
     questions = ratings_among(names, but=(rater, item, reward))
     if wanted.rating is not None and wanted.rating not in questions:
         if wanted.rating not in whole:
             raise _checks.UnknownNameError(f"{wanted.source}: column", wanted.rating, whole | set(questions))
+        if wanted.rating in (rater, item, reward):
+            role = ("rater", "item", "reward")[(rater, item, reward).index(wanted.rating)]
+            raise _checks.InvalidValueError("rating", wanted.rating, f"a column that is not already the {role}")
         questions[wanted.rating] = [wanted.rating]
     rating = wanted.rating or _one(
         list(questions), names, "holds ratings", f"name it with rating (--rating); {wide}", wanted
