@@ -120,7 +120,7 @@ def test_columns(log, capsys):
         ("log.csv --seed 0", "--seed = 0: must be left out: it is for an environment"),
         ("log.csv --by nope", "log.csv: column = 'nope': must be one of rating_ann, rating_bob, reward"),
         ("uard/TrapGrid6-v0 --set panel=mian", "panel = 'mian': must be one of"),
-        ("uard/TrapGrid6-v0 --steps 0", "steps = 0: must be a whole number >= 1"),
+        ("uard/TrapGrid6-v0 --steps 0", "steps = 0: must be a whole number in [1, 1e+07]"),
         ("uard/TrapGrid6-v0 --seed -1", "seed = -1: must be a whole number >= 0"),
     ],
 )

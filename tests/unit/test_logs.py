@@ -828,3 +828,11 @@ def test_a_list_and_a_part_of_it_are_one_column_too_many(tmp_path):
     file.write_text('{"reward":1,"rating":[1,2],"rating[0]":9}\n{"reward":1,"rating":[1,2]}\n')
     with pytest.raises(InvalidValueError, match=r"row 1, column = 'rating\[0\]': must be there only once"):
         logs.read(file)
+
+
+def test_a_decimal_comma_is_not_called_missing(tmp_path):
+    file = tmp_path / "log.csv"
+    file.write_text("reward;rating_ann\n1,5;2\n")
+    with pytest.raises(InvalidValueError, match=r"with a decimal point: 1\.5, not 1,5") as refused:
+        logs.read(file)
+    assert "--missing" not in str(refused.value)

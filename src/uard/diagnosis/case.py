@@ -168,7 +168,7 @@ def case_of(log: RatingLog, name: str, method: Mitigation) -> Case:
         return _without_reward(log, name, method)
     rows = np.flatnonzero(usable(log.reward))
     if not rows.size:
-        raise _checks.InvalidValueError(f"{log.source}: column of rewards", "no number below 1e100", "finite numbers")
+        raise _checks.InvalidValueError(f"{log.source}: column of rewards", "no number", "finite numbers below 1e100")
     reward, ratings = _usable(log.reward[rows], np.nan), _usable(log.ratings[rows], np.nan)
     sigma_m = None if log.sigma_m is None else _usable(log.sigma_m, 0.0)[rows]
     true = None if log.true_reward is None else _usable(log.true_reward, np.nan)[rows]

@@ -113,7 +113,7 @@ def _beaten(results: StudyResults, study: str, shown: tuple[str, ...]) -> str:
 
 
 def _rankings(results: StudyResults) -> list[str]:
-    """Say who is best and second where raters are noisy."""
+    """Say who is best and second where raters are noisy and it is not ``uard``."""
     out = []
     for noise in (1.2, 3.3):
         for panel in ("main", "appendix"):
@@ -122,6 +122,8 @@ def _rankings(results: StudyResults) -> list[str]:
                 ((results.of(r.cell, "true_return"), r["mitigation"]) for r in there), key=lambda x: -x[0].mean
             )
             (best, first), (second, runner) = ranking[:2]
+            if first == "uard":
+                continue
             out.append(
                 f"10x10, {panel} panel, noise sd {noise:g}: highest true return {first} {full(best)}, then {runner} {full(second)}."
             )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import decimal
 import math
 import numbers
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
@@ -194,6 +195,8 @@ class Numbers:
             return
         word = next((cell for _, _, cell in self.bad.values() if isinstance(cell, str)), None)
         hint = "" if word is None else f"; missing=({word!r},) or --missing {word!r} say that a word means so"
+        if word is not None and re.fullmatch(r"[+-]?\d+,\d+", word.strip()):
+            hint = f" (with a decimal point: {word.strip().replace(',', '.')}, not {word.strip()})"
         count, row, cell = next(iter(self.bad.values()))
         if len(self.bad) == 1 and count == 1:
             raise bad_cell(self.source, row, next(iter(self.bad))[0], cell, A_NUMBER + hint)
