@@ -60,7 +60,7 @@ def _refuse_wrapped(env: Any) -> None:
         raise _checks.InvalidValueError("env", type(env).__name__, allowed)
     if isinstance(env, NORMALISING):
         allowed = "one that goes outside, NormalizeReward(ReliabilityWrapper(env)): ratings are not in normalised units"
-        raise _checks.InvalidValueError("env", type(env).__name__, allowed)
+        raise _checks.InvalidValueError("env", "NormalizeReward", allowed)
     if isinstance(env, gymnasium.Wrapper | gymnasium.vector.VectorWrapper):
         _refuse_wrapped(cast("Any", env).env)
     elif isinstance(env, gymnasium.vector.SyncVectorEnv):
