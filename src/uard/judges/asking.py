@@ -136,7 +136,7 @@ def ask(
         By name.
 
     Raises:
-        JudgeError: if one raises an Exception; what else it raises passes as it is.
+        JudgeError: if one raises an Exception or SystemExit; what else it raises passes as it is.
     """
     size = len(question["completions"])
     limits, busy = limits or {}, {} if busy is None else busy
