@@ -244,7 +244,10 @@ def wrapped_grid():
 
 @pytest.mark.parametrize("venv", [DummyVecEnv, SubprocVecEnv])
 def test_a_vec_env_around_something_that_filters_is_refused(venv):
-    inner = venv([wrapped_grid])
+    def here():  # what is local travels whole to another process; this file is no module there
+        return ReliabilityWrapper(gymnasium.make(f"uard.envs:{GRID}", panel="main"))
+
+    inner = venv([here])
     try:
         with pytest.raises(InvalidValueError, match=rf"^venv = '{venv.__name__}': .*filtered twice"):
             ReliabilityVecEnv(inner)
