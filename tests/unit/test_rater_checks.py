@@ -1,6 +1,7 @@
 """Findings about raters: found in simulated faults, and hardly ever in honest panels, over many seeds."""
 
 import json
+import os
 from collections import Counter
 
 import numpy as np
@@ -12,6 +13,7 @@ from uard import InvalidValueError, RatingLog, doctor
 from uard.diagnosis import agreement_checks, copy_checks, rater_checks, sentinel_checks
 from uard.diagnosis.case import as_filter, case_of
 
+PANELS = int(os.environ.get("UARD_PANELS", "150"))  # of each kind; docs/guides/doctor.md says what 1000 give
 CHECKS = (
     sentinel_checks.sentinel_value,
     rater_checks.straight_lines,
@@ -62,9 +64,10 @@ def honest(kind, seed):
 
 @pytest.mark.parametrize("kind", ["dense", "sparse", "binary", "sorted", "blocks"])
 def test_honest_raters_are_hardly_ever_accused(kind):
-    alarms = Counter(code for seed in range(1000, 1150) for code in codes(honest(kind, seed)))
-    assert max(alarms.values(), default=0) <= 4, alarms
-    assert alarms.total() <= 6, alarms
+    alarms = Counter(code for seed in range(1000, 1000 + PANELS) for code in codes(honest(kind, seed)))
+    print(f"{kind}: of {PANELS} honest panels accused: {dict(alarms)}")
+    assert max(alarms.values(), default=0) <= 4 * PANELS / 150, alarms
+    assert alarms.total() <= 6 * PANELS / 150, alarms
 
 
 def share_found(code, make, seeds=30):

@@ -11,6 +11,7 @@ from uard.method.arrays import Array, namespace, where
 from uard.method.feedback import ByRater, Feedback
 from uard.method.mitigations.protocol import Evidence, LearningSignal, Mitigation
 from uard.method.rater_statistics import RaterStatistics, masked_median
+from uard.method.uncertainty import root
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -100,11 +101,12 @@ class ExcessDisagreement(Mitigation):
         statistics = rater_statistics.of_raters(statistics, each.count.shape[-1])
         here = (each.count > 0) & (statistics.heard > 0)
         variance = pooled.errors(r, each, statistics, slack=0.0)
-        said = pooled.pool(r, each.mean - statistics.bias, here, variance, statistics.span)
-        cap = pooled.precise_mean(each.mean - statistics.bias, here, variance) - self.k * said.tau
-        u = statistics.typical
-        unrated = namespace(r).minimum(r, u + 0.0 * r)
-        return LearningSignal(where(said.heard > 0, namespace(r).minimum(r, cap), unrated), 1.0)
+        said, xp = each.mean - statistics.bias, namespace(r)
+        tau = root(pooled.variance_between(said, here, variance))
+        cap = xp.where(
+            xp.any(here, axis=-1), pooled.precise_mean(said, here, variance) - self.k * tau, statistics.typical
+        )
+        return LearningSignal(xp.minimum(r, cap), 1.0)
 
 
 def each_rater(feedback: Feedback) -> ByRater:
