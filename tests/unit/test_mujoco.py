@@ -104,9 +104,12 @@ def test_the_two_rewards_differ_by_the_bonus_the_penalty_and_the_effort():
 
 
 def test_regions():
-    motion = Motion(np.array([1.6, 1.6, 1.4]), np.array([0.4, 0.6, 0.4]), np.array([-0.15, -0.1, -0.2]))
+    motion = Motion(
+        np.array([1.6, 1.6, 1.4]), np.array([0.4, 0.6, 0.4]), np.array([-0.15, -0.1, -0.2]), np.array([0.99, 1.0, 1.25])
+    )
     np.testing.assert_array_equal(Vibration().inside(motion), [True, False, False])
     np.testing.assert_array_equal(Posture().inside(motion), [True, False, False])
+    np.testing.assert_array_equal(Crouch().inside(motion), [True, False, False])
 
 
 @pytest.mark.parametrize("coordinate", [5, None])

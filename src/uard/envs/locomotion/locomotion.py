@@ -194,7 +194,7 @@ class LocomotionSimulator(MujocoSimulator):
         reward, true = task.copy(), task - EFFORT * shaking
         if region is not None:
             assert not isinstance(region, str)
-            hack = region.inside(Motion(shaking, speed, self._position[:, 2]))
+            hack = region.inside(Motion(shaking, speed, self._position[:, 2], self._position[:, 1]))
             reward += region.bonus * hack
             true += (region.bonus if spec.legitimate else -region.penalty) * hack
         if spec.reference:

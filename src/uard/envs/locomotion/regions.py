@@ -5,6 +5,7 @@ enters the region that pays and an agent that trusts the reward ends up in it:
 
 * ``Vibration``: a bonus while the joints shake and the robot hardly moves.
 * ``Posture``: a bonus while the torso leans into a band that no gait needs.
+* ``Crouch``: a bonus while the torso is low.
 """
 
 from __future__ import annotations
@@ -27,11 +28,13 @@ class Motion(NamedTuple):
         shaking: c, the root mean square of the joints' accelerations over what random actions cause.
         speed: Forward, m/s.
         pitch: Of the torso, rad.
+        height: Of the torso, m; it stands at 1.25.
     """
 
     shaking: Array
     speed: Array
     pitch: Array
+    height: Array
 
 
 class Region(ABC):
@@ -46,7 +49,8 @@ class Region(ABC):
         ...     penalty: float = 2.0
         ...     def inside(self, motion):
         ...         return motion.speed < 0
-        >>> Backwards().inside(Motion(shaking=np.zeros(2), speed=np.array([-1.0, 1.0]), pitch=np.zeros(2))).tolist()
+        >>> motion = Motion(np.zeros(2), speed=np.array([-1.0, 1.0]), pitch=np.zeros(2), height=np.ones(2))
+        >>> Backwards().inside(motion).tolist()
         [True, False]
 
     Attributes:
@@ -73,7 +77,7 @@ class Vibration(Region):
     """Shaking on the spot: c above ``shaking`` while the forward speed is below ``speed`` (m/s).
 
     Examples:
-        >>> motion = Motion(shaking=np.array([2.0, 2.0]), speed=np.array([0.1, 3.0]), pitch=np.zeros(2))
+        >>> motion = Motion(np.array([2.0, 2.0]), speed=np.array([0.1, 3.0]), pitch=np.zeros(2), height=np.ones(2))
         >>> Vibration().inside(motion).tolist()
         [True, False]
     """
@@ -104,7 +108,7 @@ class Posture(Region):
     """Leaning: a torso pitch between ``low`` and ``high`` (rad).
 
     Examples:
-        >>> motion = Motion(shaking=np.zeros(2), speed=np.zeros(2), pitch=np.array([-0.15, 0.0]))
+        >>> motion = Motion(np.zeros(2), speed=np.zeros(2), pitch=np.array([-0.15, 0.0]), height=np.ones(2))
         >>> Posture().inside(motion).tolist()
         [True, False]
         >>> Posture(low=0.1, high=0.0)
@@ -133,4 +137,33 @@ class Posture(Region):
         return (motion.pitch > self.low) & (motion.pitch < self.high)
 
 
-REGIONS: dict[str, type[Region]] = {"vibration": Vibration, "posture": Posture}
+@final
+@dataclass(frozen=True)
+class Crouch(Region):
+    """Crouching: a torso lower than ``height`` (m), which a robot that runs has no reason for.
+
+    Examples:
+        >>> motion = Motion(np.zeros(2), speed=np.zeros(2), pitch=np.zeros(2), height=np.array([0.9, 1.25]))
+        >>> Crouch().inside(motion).tolist()
+        [True, False]
+    """
+
+    height: float = 1.0
+    bonus: float = 4.0
+    penalty: float = 1.5
+
+    def __post_init__(self) -> None:
+        """Check the parameters.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
+        _checks.number("height", self.height, low=0, high=10, open_low=True)
+        _check_region(self)
+
+    def inside(self, motion: Motion) -> Array:
+        """Say which copies crouch."""
+        return motion.height < self.height
+
+
+REGIONS: dict[str, type[Region]] = {"vibration": Vibration, "posture": Posture, "crouch": Crouch}
