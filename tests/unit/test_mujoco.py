@@ -8,7 +8,7 @@ from uard._checks import InvalidValueError, UnknownNameError
 from uard.envs.locomotion.inverted_pendulum import InvertedPendulum
 from uard.envs.locomotion.locomotion import Kick, Locomotion
 from uard.envs.locomotion.mujoco import PhysicsError
-from uard.envs.locomotion.regions import Motion, Posture, Vibration
+from uard.envs.locomotion.regions import Crouch, Motion, Posture, Vibration
 from uard.envs.simulator import rate
 from uard.ratings.panels import APPENDIX
 
