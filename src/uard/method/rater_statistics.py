@@ -16,6 +16,7 @@ from uard.method.uncertainty import masked_mean
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
+EQUAL = 1e-5  # of their mean: rewards that deviate by less are all the same
 FLOOR = 0.01  # of the reward's scale: no rater is more exact
 MOST = 4096  # state-actions over which statistics are taken; of more, these are evenly spread
 CHI2_MEDIAN = 0.455  # of one degree of freedom
@@ -74,7 +75,8 @@ def fit(reward: Float[Array, " n"], by_rater: ByRater, rated: Bool[Array, " n"])
     count, said = xp.where(here, by_rater.count, xp.zeros_like(by_rater.count)), by_rater.mean
     centre = masked_mean(reward, rated)
     deviation = xp.sqrt(masked_mean((reward - centre) ** 2, rated))
-    scale = xp.where(deviation > 0, deviation, xp.ones_like(deviation))
+    # Equal rewards differ by what rounding makes of their running means; that is no scale.
+    scale = xp.where(deviation > EQUAL * abs(centre), deviation, xp.ones_like(deviation))
     floor = (FLOOR * scale) ** 2
     noise = answer_variance(count, by_rater.m2, scale)
     bias = robust_bias(count, said - reward[:, None], noise, scale)

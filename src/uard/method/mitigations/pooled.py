@@ -53,7 +53,9 @@ class PooledDiscounting(Mitigation):
         contest: How many tau the anchor lies below the pooled mean, >= 0.
         caution: How many standard errors of the pooled mean it lies below that, >= 0.
         risk: Premium >= 0 for not knowing which hypothesis holds, in posterior standard deviations.
-        unrated_weight: How far an extraordinary reward is believed that nobody has rated, in [0, 1].
+        unrated_weight: How far an extraordinary reward is believed that nobody has rated, in [0, 1]. A higher one
+            explores more: better on random problems whose raters answer seldom (development regret .09 at 0.05, .05
+            at 1), but with 0.4 an agent on the paper's 10x10 grid no longer reaches the goal at 1 % rated steps.
         vetoes: How many lone low dissenters may be overruled, see ``uard.method.pooled.overruled``; >= 0.
     """
 
