@@ -59,7 +59,6 @@ class PooledDiscounting(Mitigation):
 
     discounts: ClassVar[bool] = True
     refits_early: ClassVar[bool] = True
-    needs_rater_identity: ClassVar[bool] = True
 
     lies: float = 0.2
     slack: float = 0.1

@@ -16,17 +16,19 @@ from uard.lab.study import Row, Study, row
 from uard.method.mitigations import named
 from uard.ratings.panels import as_panel
 from uard.replication.studies import derive
-from uard.training.feedback.transition_model import QUERIES
+from uard.training.feedback.transition_model import QUERIES, TransitionModel
 
 REGIONS = {"vibration": Vibration, "posture": Posture}
 RATED = 0.15
+RATINGS = TransitionModel(predicts="ratings")
 EARLY = 100  # few agents of the smaller sizes still stand at step 500
 NOISE_UNIT = Vibration().bonus  # the paper's noise is in per cent, of what it does not say: of the bonus, here
 RIVALS = ("mean-of-annotations", "worst-of-annotations", "lcb")
 
 
-def _cell(environment: Locomotion, mitigation: Any, agent: Any, steps: int, **more: Any) -> Cell:
-    return Cell(environment, mitigation, agent, rated=RATED, steps=steps, **more)
+def _cell(environment: Locomotion, mitigation: Any, agent: Any, steps: int, rated: float = RATED, **more: Any) -> Cell:
+    # The model of version 0.1, with which all of these were trained.
+    return Cell(environment, mitigation, agent, rated=rated, steps=steps, rating_model=RATINGS, **more)
 
 
 def _panels(mitigation: str) -> tuple[str, ...]:
@@ -221,7 +223,7 @@ def caution(scale: Scale) -> tuple[Row, ...]:
         "worst-of-annotations": ("worst-of-annotations", {}, RATED),
     }
     return tuple(
-        row(Cell(plain, named(mitigation, **changes), agent, rated=rated, steps=steps), learns_from=label)
+        row(_cell(plain, named(mitigation, **changes), agent, steps, rated=rated), learns_from=label)
         for label, (mitigation, changes, rated) in variants.items()
     )
 
