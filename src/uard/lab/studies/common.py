@@ -13,14 +13,12 @@ WALKER = QLearning(heads=1, epsilon=1.0, epsilon_decay=1.0, epsilon_min=1.0)  # 
 LOCOMOTION_STEPS = 200_000  # in MuJoCo, on a CPU
 
 
-def can_use(mitigation: Mitigation, trainer: Trainer, rating_model: object) -> bool:
-    """Whether a trainer and its model of ratings, or None, give a mitigation all that it asks for.
+def can_use(mitigation: Mitigation, trainer: Trainer) -> bool:
+    """Whether a trainer can give a mitigation all that it asks for.
 
     Examples:
         >>> from uard.lab.registry import AGENTS, ENVIRONMENTS, trainer
-        >>> can_use(named("true-reward"), trainer(AGENTS["ppo"], ENVIRONMENTS["TrapGrid6"]), None)
+        >>> can_use(named("true-reward"), trainer(AGENTS["ppo"], ENVIRONMENTS["TrapGrid6"]))
         False
     """
-    if mitigation.reads_truth and not trainer.knows_truth:
-        return False
-    return rating_model is None or not mitigation.needs_rater_identity
+    return trainer.knows_truth or not mitigation.reads_truth

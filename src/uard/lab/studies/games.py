@@ -48,7 +48,7 @@ def gaming() -> tuple[Row, ...]:
         for name, agent in agents.items()
         if can_work(agent, game)
         for mitigation in COMPARED
-        if can_use(named(mitigation), trainer(agent, game), None if isinstance(agent, QLearning) else RatingModel())
+        if can_use(named(mitigation), trainer(agent, game))
     )
 
 

@@ -71,7 +71,7 @@ def _crossed(where: str, environment: Any, name: str, agent: Any, panels: tuple[
         )
         for panel in panels
         for mitigation in mitigations()
-        if can_use(named(mitigation), trainer, rating_model)
+        if can_use(named(mitigation), trainer)
     ]
 
 
