@@ -203,7 +203,7 @@ def test_nobody_heard_is_met_with_caution():
 
 
 def test_it_is_made_by_name_and_checked():
-    assert named("pooled", vetoes=1) == PooledDiscounting(vetoes=1)
+    assert named("uard", vetoes=1) == PooledDiscounting(vetoes=1)
     for field, value in [("lies", 0.0), ("slack", -1.0), ("vetoes", 1.5), ("risk", float("nan"))]:
         with pytest.raises(InvalidValueError, match=field):
             PooledDiscounting(**{field: value})

@@ -21,10 +21,10 @@ from uard.ratings.panels import MAIN, Panel, random_panel
 
 FIRST_SEED, SEEDS = 100, 8
 RATED = 0.15
-RULES = ("pooled", "mean-of-annotations", "median", "worst-of-annotations", "min-proxy-median")
-MORE = (*RULES, "lcb", "uard")  # on Hopper
+RULES = ("uard", "mean-of-annotations", "median", "worst-of-annotations", "min-proxy-median")
+MORE = (*RULES, "lcb", "uard-0.1")  # on Hopper
 TASKS = (("hopper", "crouch"), ("hopper", "posture"), ("walker2d", "crouch"))
-NOISY = ("pooled", "mean-of-annotations", "worst-of-annotations", "min-proxy-median")
+NOISY = ("uard", "mean-of-annotations", "worst-of-annotations", "min-proxy-median")
 NOISES = (0.0, 0.1, 0.2, 0.3)  # of the bonus
 FIVE = 5
 SCALE = 0.5  # of the panels: rewards lie within -2 and 7, a grid's within -1 and 12

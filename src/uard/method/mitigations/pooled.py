@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from uard import _checks
 from uard.method import pooled, rater_statistics
@@ -129,3 +129,19 @@ class PooledDiscounting(Mitigation):
             xp.where(rated, b, u + 0.0 * b),
             p.tau,
         )
+
+
+def uard(**changes: Any) -> PooledDiscounting:
+    """What we recommend: the pooled rule, a pure reward transform that knows who said what.
+
+    Examples:
+        >>> uard().vetoes, uard(vetoes=1).vetoes
+        (0, 1)
+
+    Args:
+        changes: Parameters of ``PooledDiscounting`` that are not the recommended ones.
+
+    Raises:
+        InvalidValueError: naming the parameter, the value and what is allowed.
+    """
+    return PooledDiscounting(**changes)
