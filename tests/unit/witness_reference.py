@@ -46,7 +46,7 @@ def parts(z, v0, r, us, P=PRIOR):
     B, C = W.copy(), W.copy()
 
     def wrong(R, v):  # a rater who errs: between truth and proxy (or beyond it, as others do), or repeats the proxy
-        a, b = np.where(R < r, R, r), np.where(R < r, top, R)
+        a, b = np.where(r > R, R, r), np.where(r > R, top, R)
         w, sd = b - a, np.sqrt(v)
         wide = between((a - z) / sd, (b - z) / sd) / np.where(w > 1e-9, w, 1)
         return 0.5 * np.where(w > 1e-9, wide, pdf(z - R, v)) + 0.5 * pdf(z - r, vr)
@@ -68,7 +68,7 @@ def parts(z, v0, r, us, P=PRIOR):
         v = at(R)
         L = one((1 - q - eps) * pdf(z - R, v) + q * wrong(R, v) + out(R))
         R, V, m = R[:, 0], V[:, 0], np.maximum(m[:, 0], 1)
-        over = R < r[:, 0]
+        over = r[:, 0] > R
         room = np.where(over, np.maximum(r[:, 0] - us["lo"], 0), np.maximum(us["hi"] - r[:, 0], 0))
         prior = 1 / (room + us["scale"])
         wt = np.where(here[:, j] & (12 * v0[:, j] <= rng**2), L * prior * np.sqrt(2 * np.pi * V) / m, 0.0)
