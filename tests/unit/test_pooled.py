@@ -27,7 +27,6 @@ RULES = {
 }
 every_rule = pytest.mark.parametrize("rule", RULES.values(), ids=RULES)
 LIBRARIES = {"numpy": np.asarray, "torch": torch.tensor, "jax": jnp.asarray}
-every_library = pytest.mark.parametrize("convert", LIBRARIES.values(), ids=LIBRARIES)
 
 
 def panel_data(seed: int, rows: int = 60, raters: int | None = None) -> tuple[np.ndarray, ByRater]:
@@ -103,7 +102,7 @@ def test_the_reference_gives_the_same(seed):
 
 
 @every_rule
-@every_library
+@pytest.mark.parametrize("convert", [torch.tensor, jnp.asarray], ids=["torch", "jax"])
 def test_libraries_agree(rule, convert):
     reward, each = panel_data(3, rows=40, raters=7)
     expected, _ = explained(reward, each, rule)
@@ -140,41 +139,41 @@ AWKWARD += ("nothing varies", "far apart", "single state-action", "64 raters")
 
 
 @every_rule
-@every_library
-@pytest.mark.parametrize("name", AWKWARD)
-def test_awkward_panels_give_numbers(rule, convert, name):
-    reward, each = awkward(name)
-    why, statistics = explained(reward, each, rule, convert)
-    assert all(np.isfinite(np.asarray(x)).all() for x in (why.signal.reward, *why[1:]))
-    weight = np.asarray(why.weight)
-    assert ((weight >= 0) & (weight <= 1)).all()
-    if name == "only the excluded answer here":
-        heard = np.asarray(getattr(statistics, "raters", statistics).heard)
-        assert heard.tolist() == [1.0, 1.0, 0.0]
-        silent = each._replace(count=np.where(np.arange(24)[:, None] < 12, 0.0, each.count))
-        alone, _ = explained(reward, silent, rule)  # those rows are met like rows that nobody has rated
-        assert np.allclose(weight[:12], np.asarray(alone.weight)[:12])
+@pytest.mark.parametrize("library", ["numpy", "torch", "jax"])
+def test_awkward_panels_give_numbers_and_gradients(rule, library):
+    """By every rating and every reward, through the panel's statistics, too."""
+
+    def learned(reward, mean, feedback, count):
+        each = feedback.by_rater._replace(mean=mean, count=count)
+        known = feedback._replace(proxy=reward, by_rater=each)
+        why = rule.explain(Evidence(reward, 0.0 * reward, known), rule.fit(known, known.count > 0))
+        return why.signal.reward.sum(), (why.signal.reward, *why[1:])
+
+    by_jax = jax.jit(jax.grad(learned, argnums=(0, 1), has_aux=True))
+    for name in AWKWARD:
+        reward, each = awkward(name)
+        feedback = feedback_of(reward, each, LIBRARIES[library])
+        given = [feedback.proxy, feedback.by_rater.mean]
+        if library == "jax":
+            slopes, found = by_jax(*given, feedback, feedback.by_rater.count)
+        else:
+            given = [x.requires_grad_() for x in given] if library == "torch" else given
+            total, found = learned(*given, feedback, feedback.by_rater.count)
+            slopes = torch.autograd.grad(total, given) if library == "torch" else []
+        found, slopes = ([np.asarray(x.detach() if library == "torch" else x) for x in y] for y in (found, slopes))
+        assert all(np.isfinite(x).all() for x in (*found, *slopes)), name
+        assert ((found[3] >= 0) & (found[3] <= 1)).all(), name
 
 
 @every_rule
-@pytest.mark.parametrize("name", AWKWARD)
-@pytest.mark.parametrize("library", ["torch", "jax"])
-def test_gradients_are_finite(rule, name, library):
-    """By every rating and every reward, through the panel's statistics, too."""
-    reward, each = awkward(name)
-
-    def learned(reward, mean, convert):
-        feedback = feedback_of(np.zeros(len(each.count)), each, convert)
-        known = feedback._replace(proxy=reward, by_rater=feedback.by_rater._replace(mean=mean))
-        return rule.signal(Evidence(reward, 0.0 * reward, known), rule.fit(known, known.count > 0)).reward.sum()
-
-    if library == "jax":
-        given = jnp.asarray(reward), jnp.asarray(each.mean)
-        found = jax.grad(lambda *x: learned(*x, jnp.asarray), argnums=(0, 1))(*given)
-    else:
-        given = [torch.tensor(x, requires_grad=True) for x in (reward, each.mean)]
-        found = torch.autograd.grad(learned(*given, torch.tensor), given)
-    assert all(np.isfinite(np.asarray(x)).all() for x in found)
+def test_what_only_excluded_raters_have_said_is_met_like_what_nobody_has(rule):
+    reward, each = awkward("only the excluded answer here")
+    why, statistics = explained(reward, each, rule)
+    assert getattr(statistics, "raters", statistics).heard.tolist() == [1.0, 1.0, 0.0]
+    feedback = feedback_of(reward, each)
+    nobody = feedback._replace(by_rater=each._replace(count=0.0 * each.count))
+    unrated = rule.signal(Evidence(reward, 0.0 * reward, nobody), statistics).reward
+    assert why.signal.reward[:12].tolist() == unrated[:12].tolist()
 
 
 some_panels = st.tuples(st.integers(0, 10_000), st.integers(1, 64))
@@ -247,7 +246,6 @@ def test_where_raters_differ_by_no_more_than_their_errors_a_rating_that_says_the
 ):
     """By a new rater, or by one of these, whose error it shrinks; tau is 0 before and after."""
     said, errors = (list(x) for x in zip(*panel, strict=True))
-    here = np.ones((1, len(said)), bool)
     for longer, better in (([*said, 0.0], [*errors, variance]), ([0.0, *said[1:]], [shrunk * errors[0], *errors[1:]])):
         before = (said, errors) if len(longer) > len(said) else (longer, errors)
         taus = [
@@ -256,7 +254,6 @@ def test_where_raters_differ_by_no_more_than_their_errors_a_rating_that_says_the
         ]
         if not np.any(taus):
             assert odds_at_zero(longer, better) <= odds_at_zero(*before) + 1e-9
-    assert here.all()
 
 
 def test_an_inexact_rater_who_says_the_reward_may_lower_the_weight():
@@ -266,24 +263,20 @@ def test_an_inexact_rater_who_says_the_reward_may_lower_the_weight():
     assert 0.0 < after - before < 0.2
 
 
-@pytest.mark.parametrize(("rule", "seconds"), [("pooled", 20), ("pooled, 2 vetoes", 30), ("witness", 120)])
-def test_a_million_state_actions(rule, seconds):
-    """Of five raters: statistics are of 4096 of them; the rest takes some tables of 40 MB, and no longer than that."""
+def test_a_million_state_actions():
+    """Of five raters: statistics are of 4096 of them, the rest takes seconds and a dozen tables of 40 MB."""
     rows, raters = 1_000_000, 5
     random = np.random.default_rng(0)
-    reward = random.normal(size=rows)
-    each = ByRater(
-        np.full((rows, raters), 2.0), reward[:, None] + random.normal(size=(rows, raters)), np.ones((rows, raters))
-    )
+    reward, two = random.normal(size=rows), np.full((rows, raters), 2.0)
+    each = ByRater(two, reward[:, None] + random.normal(size=two.shape), 0.5 * two)
     tracemalloc.start()
-    begin = time.perf_counter()
-    why, _ = explained(reward, each, RULES[rule])
-    took, peak = time.perf_counter() - begin, tracemalloc.get_traced_memory()[1]
+    begin = time.process_time()
+    why, _ = explained(reward, each)
+    took, peak = time.process_time() - begin, tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    print(rule, took, peak / 2**20)
     assert np.isfinite(why.signal.reward).all()
-    assert took < seconds
-    assert peak < 1.5 * 2**30
+    assert took < 60
+    assert peak < 15 * two.nbytes
 
 
 def test_one_dissenter_of_five_decides_only_where_none_may_be_overruled():

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from uard.method.arrays import Array, Numbers, namespace
 from uard.method.feedback import ByRater
-from uard.method.uncertainty import masked_mean
+from uard.method.uncertainty import masked_mean, root
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -70,7 +70,7 @@ def fit(reward: Float[Array, " n"], by_rater: ByRater, rated: Bool[Array, " n"])
     here = (by_rater.count > 0) & rated[:, None]
     count, said = xp.where(here, by_rater.count, xp.zeros_like(by_rater.count)), by_rater.mean
     centre = masked_mean(reward, rated)
-    deviation = xp.sqrt(masked_mean((reward - centre) ** 2, rated))
+    deviation = root(masked_mean((reward - centre) ** 2, rated))
     scale = xp.where(deviation > 0, deviation, xp.ones_like(deviation))
     floor = (FLOOR * scale) ** 2
     noise = answer_variance(count, by_rater.m2, scale)

@@ -32,6 +32,7 @@ ROUNDS = 15  # of expectation maximisation
 LIES_WORTH, OVER_WORTH = 2.0, 5.0  # state-actions, or lies, that the prior shares are worth
 FEWEST = 3  # state-actions from which it is judged whether a rater's answers depend on what is rated
 TABLE = 2**21  # entries of the largest array of hypotheses times raters; of more, some hypotheses come after others
+ROUNDING = 1e-6  # of the range: no closer than this, one number lies on no side of another
 NEVER = -1e30  # logarithm of the likelihood of a hypothesis that is not there
 _ERFC = (
     0.00819275584, 0.129908998, -0.735104204, 1.38610644, -1.06239728, 0.246833129, -0.17770727, 0.0954640677,
@@ -334,7 +335,8 @@ def _truthful(
         v = variance + off * off
         low, high = xp.where(truth < r, truth, r), xp.where(truth < r, top, truth)
         errs = 0.5 * _uniform(said, xp.sqrt(v), low, high) + 0.5 * repeats
-        away = xp.where(r > truth, said < truth, said > truth)
+        beyond = xp.where(r > truth, truth - said, said - truth)
+        away = beyond > ROUNDING * each.width
         stray = xp.where(away, AWAY + 0.0 * v, 1.0 + 0.0 * v) * prior.stray / each.width
         tells = right * _density(said - truth, v)
         return tells, tells + prior.errs * errs + stray, v
