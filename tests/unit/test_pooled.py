@@ -265,6 +265,31 @@ def test_an_inexact_rater_who_says_the_reward_may_lower_the_weight():
     assert 0.0 < after - before < 0.2
 
 
+@pytest.mark.parametrize("raters", [2, 3, 5, 8, 12, 30])
+def test_few_panels_lose_weight_by_a_rating_that_says_the_reward(raters):
+    """By a new rater or by a better known one, tau estimated anew."""
+    random, rows = np.random.default_rng(raters), 20_000
+    said = np.exp(random.uniform(-2, 2, (rows, 1))) * random.normal(size=(rows, raters))
+    said[:, 0], variance = 0.0, np.exp(random.uniform(-4, 2, (rows, raters)))
+    better = np.concatenate([variance[:, :1] * random.uniform(0.05, 1.0, (rows, 1)), variance[:, 1:]], axis=1)
+
+    def odds(first: int, variance: np.ndarray) -> np.ndarray:
+        here = np.ones(variance[:, first:].shape, bool)
+        return pooled.pool(np.zeros(rows), said[:, first:], here, variance[:, first:], 20.0).log_odds
+
+    before = odds(0, variance)
+    for grown in (before - odds(1, variance), odds(0, better) - before):
+        assert np.mean(grown > 1e-9) < 0.02
+
+
+def test_a_lie_that_all_see_is_doubted_as_soon_as_the_page_says():
+    """All say r - g: w < 1/2 if g^2 > [log(1 + D^2 P) + 2 log 4] / P, P being the sum of 1 / v_k."""
+    variance = np.array([0.5, 1.0, 2.0])
+    precision = (1 / variance).sum()
+    gap = np.sqrt((np.log(1 + 20.0**2 * precision) + 2 * np.log(4.0)) / precision)
+    assert odds_at_zero([-gap] * 3, variance) == pytest.approx(np.log(4.0))
+
+
 def test_a_million_state_actions():
     """Of five raters: statistics are of 4096 of them, the rest takes seconds and a dozen tables of 40 MB."""
     rows, raters = 1_000_000, 5
