@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from uard.method.arrays import Array, Numbers, namespace
 from uard.method.feedback import ByRater
-from uard.method.uncertainty import masked_mean
+from uard.method.uncertainty import masked_mean, root
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -68,13 +68,11 @@ def fit(reward: Float[Array, " n"], by_rater: ByRater, rated: Bool[Array, " n"])
         rated: Which of them anybody has rated.
     """
     xp = namespace(by_rater.mean)
-    every = -(-reward.shape[0] // MOST)
-    if every > 1:
-        reward, rated, by_rater = reward[::every], rated[::every], ByRater._make(x[::every] for x in by_rater)
+    reward, by_rater, rated = thinned(reward, by_rater, rated)
     here = (by_rater.count > 0) & rated[:, None]
     count, said = xp.where(here, by_rater.count, xp.zeros_like(by_rater.count)), by_rater.mean
     centre = masked_mean(reward, rated)
-    deviation = xp.sqrt(masked_mean((reward - centre) ** 2, rated))
+    deviation = root(masked_mean((reward - centre) ** 2, rated))
     # Equal rewards differ by what rounding makes of their running means; that is no scale.
     scale = xp.where(deviation > EQUAL * abs(centre), deviation, xp.ones_like(deviation))
     floor = (FLOOR * scale) ** 2
@@ -93,6 +91,49 @@ def fit(reward: Float[Array, " n"], by_rater: ByRater, rated: Bool[Array, " n"])
     return RaterStatistics(
         noise, bias, idiosyncrasy, xp.astype(quiet, sd.dtype), floor, masked_median(reward, rated), span, scale
     )
+
+
+def thinned(
+    reward: Float[Array, " n"], by_rater: ByRater, rated: Bool[Array, " n"]
+) -> tuple[Float[Array, " m"], ByRater, Bool[Array, " m"]]:
+    """Return at most ``MOST`` of the state-actions, evenly spread.
+
+    Examples:
+        >>> import numpy as np
+        >>> table = ByRater(*np.zeros((3, 10_000, 2)))
+        >>> thinned(np.zeros(10_000), table, np.ones(10_000, bool))[0].shape
+        (3334,)
+
+    Args:
+        reward: Mean observed reward of each distinct state-action.
+        by_rater: What each rater has said of it, (n, K) arrays.
+        rated: Which of them anybody has rated.
+    """
+    every = max(1, -(-reward.shape[0] // MOST))
+    return reward[::every], ByRater._make(x[::every] for x in by_rater), rated[::every]
+
+
+def error_of_means(by_rater: ByRater, statistics: RaterStatistics) -> Float[Array, "*batch K"]:
+    """Return the variance of each rater's mean about what is meant, in squared reward units.
+
+    The variance of one answer is the rater's own over all state-actions, corrected by what was seen here; to the error
+    of the mean come the rater's idiosyncrasy and the floor.
+
+    Examples:
+        >>> import numpy as np
+        >>> reward = np.array([0.0, 0.0, 10.0])
+        >>> twice = ByRater(np.full((3, 1), 2.0), reward[:, None], np.full((3, 1), 0.5))
+        >>> error_of_means(twice, fit(reward, twice, np.ones(3, bool))).round(2).tolist()
+        [[0.24], [0.24], [0.24]]
+
+    Args:
+        by_rater: What each rater has said here; where nothing was said the variance is that of one answer.
+        statistics: Of the panel.
+    """
+    xp, n = namespace(by_rater.mean), by_rater.count
+    one = xp.ones_like(n)
+    answer = (4.0 * statistics.noise + by_rater.m2) / (4.0 + xp.maximum(n - 1.0, 0.0 * one))
+    return answer / xp.where(n > 0, n, one) + statistics.idiosyncrasy + statistics.floor
 
 
 def of_raters(statistics: RaterStatistics, raters: int) -> RaterStatistics:
