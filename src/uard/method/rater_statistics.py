@@ -20,6 +20,7 @@ FLOOR = 0.01  # of the reward's scale: no rater is more exact
 MOST = 4096  # state-actions over which statistics are taken; of more, these are evenly spread
 CHI2_MEDIAN = 0.455  # of one degree of freedom
 ROUNDS = 5  # of Huber's iteration
+DRAWN = 4.0  # state-actions' worth of no bias that a bias is drawn towards
 LOUDEST = 2.0  # times the median deviation: who is noisier is not heard, among three raters or more
 
 
@@ -166,7 +167,7 @@ def robust_bias(
         mean = xp.sum(xp.where(here, weight * gap, zero), axis=0) / xp.where(total > 0, total, xp.ones_like(total))
         bias = xp.where(total > 0, mean, bias)
     rated = xp.sum(xp.astype(here, gap.dtype), axis=0)
-    return bias * rated / (rated + 4.0)
+    return bias * rated / (rated + DRAWN)
 
 
 def own_variance(
