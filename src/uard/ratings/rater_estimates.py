@@ -81,7 +81,7 @@ def answers_of(log: RatingLog) -> Answers:
     for column, name in zip(log.ratings.T, log.raters, strict=True):
         _moderate(log.source, column, name)
     n, raters = log.ratings.shape
-    item: Any = np.arange(n) if log.item is None else np.unique(log.item, return_inverse=True)[1]
+    item = _numbered(np.arange(n) if log.item is None else log.item)
     items = int(item.max()) + 1
     row, rater = np.nonzero(~np.isnan(log.ratings))
     rating = log.ratings[row, rater]
@@ -116,6 +116,10 @@ def answers_of(log: RatingLog) -> Answers:
         of_items(log.true_reward, "true_reward"),
         None if log.by is None else log.by[first],
     )
+
+
+def _numbered(item: Any) -> Integer[np.ndarray, " n"]:
+    return np.unique(item, return_inverse=True)[1]
 
 
 def _moderate(source: str, column: Float[np.ndarray, " n"], name: str) -> None:
@@ -304,11 +308,13 @@ class PanelEstimates:
 def _standardised(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
     """Return values in standard deviations of their columns; 0 in a constant column, NaN where they are missing."""
     here = np.isfinite(values)
+    held = np.where(here, values, 0.0)
     number = np.maximum(here.sum(0), 1)
-    centred = values - np.where(here, values, 0.0).sum(0) / number
-    sd = np.sqrt(np.where(here, centred**2, 0.0).sum(0) / number)
-    some = sd > 1e-12 * np.abs(np.where(here, values, 0.0)).max(0, initial=0.0)
-    return np.where(some, centred / np.where(some, sd, 1.0), 0.0 * centred)
+    centred = np.where(here, held - held.sum(0) / number, 0.0)
+    sd = np.sqrt((centred * centred).sum(0) / number)
+    some = sd > 1e-12 * np.abs(held).max(0, initial=0.0)
+    scaled = np.where(some, centred / np.where(some, sd, 1.0), 0.0)
+    return np.where(here, scaled, np.nan)
 
 
 def _differences(
@@ -333,5 +339,5 @@ def _beyond_others(bias: Float[np.ndarray, " K"], others: Bool[np.ndarray, "K K"
 def _least_squares(matrix: Float[np.ndarray, "K K"], right: Float[np.ndarray, " K"]) -> Float[np.ndarray, " K"]:
     """Return the shortest of the solutions."""
     scale = max(float(np.abs(right).max(initial=0.0)), 1e-300)
-    solution = cast("Any", np.linalg.lstsq(matrix, right / scale, rcond=1e-10)[0])  # untyped
-    return scale * solution
+    solution = cast("np.ndarray", np.linalg.lstsq(matrix, right / scale, rcond=1e-10)[0])  # untyped
+    return np.multiply(solution, scale)
