@@ -27,7 +27,7 @@ from uard.ratings.raters import columns_of_text
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Integer, Shaped
 
-PAIRS = 200_000  # of items that are compared; of more, so many are drawn
+PAIRS = 50_000  # of items that are compared; of more, so many are drawn
 COMPARISONS = 2_000_000  # of a pair by a rater, at most
 RULES = ("cautious", "pooled", "mean", "median", "reward")
 
@@ -37,7 +37,7 @@ class OrderAgreement:
     """How a rule's order of items agrees with the raters'.
 
     Examples:
-        >>> OrderAgreement("mean", "ann", 10, Estimate(0.9, 0.8, 1.0), None).tau
+        >>> OrderAgreement("mean", "ann", 10, Estimate(0.9, 0.8, 1.0), 0.95).tau
         Estimate(value=0.8, low=0.6000000000000001, high=1.0)
 
     Attributes:
@@ -48,14 +48,14 @@ class OrderAgreement:
         pairs: How many pairs of items the rater tells apart (and are compared).
         alike: Share of pairs in the same order if this rater is left out of the pool, in [0, 1]; None where nobody else
             has rated.
-        with_own: The same if this rater is in it.
+        with_own: The same share if this rater is in it.
     """
 
     rule: str
     rater: str
     pairs: int
     alike: Estimate | None
-    with_own: Estimate | None
+    with_own: float | None
 
     @property
     def tau(self) -> Estimate | None:
@@ -80,7 +80,7 @@ class Orders:
         own: What the raters' orders are: ``ratings``, or the name of what was given instead.
         within: The name of what divides the items into groups, of which only items of one are compared; or None.
         groups: How many groups have a pair.
-        rows: First all raters together, then each; every rule.
+        rows: First all raters together, then each; every rule. Empty where no rater tells two items apart.
     """
 
     own: str
@@ -92,7 +92,7 @@ class Orders:
         """Return everything as plain data that JSON can hold."""
 
         def plain(row: OrderAgreement) -> dict[str, Any]:
-            told = {name: getattr(row, name) for name in ("alike", "with_own", "tau")}
+            told = {name: getattr(row, name) for name in ("alike", "tau")}
             return asdict(row) | {name: None if x is None else x._asdict() for name, x in told.items()}
 
         return asdict(self) | {"rows": [plain(row) for row in self.rows]}
@@ -109,12 +109,14 @@ class Orders:
                 str(r.pairs),
                 "?" if r.alike is None else f"{r.alike:.3f}",
                 "?" if r.tau is None else f"{r.tau.value:z.2f}",
-                "?" if r.with_own is None else f"{r.with_own.value:.3f}",
+                "?" if r.with_own is None else f"{r.with_own:.3f}",
                 "",
             )
             for r in self.rows
         ]
-        return "\n".join([title, *columns_of_text([head, *rows])])
+        return "\n".join(
+            [title, *columns_of_text([head, *rows])] if rows else [f"{title}: no pair that a rater tells apart"]
+        )
 
 
 def orders(
@@ -156,15 +158,19 @@ def orders(
     first, second = np.split(place, 2)
     answers, theirs = answers.at(used), theirs[used]
     unit = np.arange(used.size) if groups is None else groups[used]
-    difference = np.sign(theirs[first] - theirs[second])  # NaN where one is missing
-    told = np.isfinite(difference) & (difference != 0)
+    difference = np.nan_to_num(np.sign(theirs[first] - theirs[second]))  # 0 where one is missing
+    told = difference != 0
+    if not told.any():
+        return Orders("ratings" if own is None else name, within, 0, ())
     names = ("all", *log.raters)
     rows: dict[str, list[OrderAgreement]] = {n: [] for n in names}
     for rule, values, whole in _values(answers):
-        alike, with_own = (_shares(x, difference, told, first, second, unit) for x in (values, whole))
-        for n, a, w in zip(names, alike, with_own, strict=True):
-            pairs = told.sum() if n == "all" else told[:, log.raters.index(n)].sum()
-            rows[n].append(OrderAgreement(rule, n, int(pairs), a, w))
+        alike = _alike(values, difference, first, second)
+        value, error = jackknife(alike.shares, unit)
+        with_own = _alike(whole, difference, first, second).shares(np.arange(len(unit)))
+        for n, v, e, w, pairs in zip(names, value, error, with_own, (told.sum(), *told.sum(0)), strict=True):
+            share = _within(interval(float(v), float(e), np.unique(unit).size))
+            rows[n].append(OrderAgreement(rule, n, int(pairs), share, float(w) if np.isfinite(w) else None))
     some = np.unique(unit[first[told.any(1)]]).size
     shown = tuple(row for n in names for row in rows[n])
     return Orders("ratings" if own is None else name, within, int(some), shown)
@@ -247,32 +253,37 @@ def _values(answers: Answers) -> list[tuple[str, Float[np.ndarray, "n K"], Float
     return found
 
 
-def _shares(
-    values: Float[np.ndarray, "n K"],
-    difference: Float[np.ndarray, "p K"],
-    told: Bool[np.ndarray, "p K"],
-    first: Integer[np.ndarray, " p"],
-    second: Integer[np.ndarray, " p"],
-    unit: Integer[np.ndarray, " n"],
-) -> list[Estimate | None]:
-    """Return the share of pairs that are ordered alike, over all raters and of each."""
-    gap = values[first] - values[second]
-    near = np.abs(gap) <= 1e-12 * np.maximum(np.abs(values[first]), np.abs(values[second]))
-    same = np.where(near, 0.5, np.where(np.sign(gap) == difference, 1.0, 0.0))
-    told = told & np.isfinite(gap)
-    same, counted = np.where(told, same, 0.0), told.astype(float)
+@dataclass(frozen=True)
+class _Alike:
+    """Which pairs (first, second) of so many items each rater tells apart, and a rule orders the same (a tie: 1/2)."""
 
-    def shares(rows: Integer[np.ndarray, " m"]) -> Float[np.ndarray, " many"]:
-        kept = np.zeros(len(unit), bool)
+    same: Float[np.ndarray, "p K"]
+    told: Float[np.ndarray, "p K"]
+    first: Integer[np.ndarray, " p"]
+    second: Integer[np.ndarray, " p"]
+    items: int
+
+    def shares(self, rows: Integer[np.ndarray, " m"]) -> Float[np.ndarray, " many"]:
+        """Return the shares among pairs of these items; NaN where there are none."""
+        kept = np.zeros(self.items, bool)
         kept[rows] = True
-        both = kept[first] & kept[second]
-        alike, pairs = both @ same, both @ counted
-        alike, pairs = np.append(alike.sum(), alike), np.append(pairs.sum(), pairs)
+        both = (kept[self.first] & kept[self.second]).astype(float)
+        alike, pairs = (np.append(x.sum(), x) for x in (both @ self.same, both @ self.told))
         return np.divide(alike, pairs, out=np.full_like(alike, np.nan), where=pairs > 0)
 
-    value, error = jackknife(shares, unit)
-    units = np.unique(unit)
-    return [_within(interval(float(v), float(e), len(units))) for v, e in zip(value, error, strict=True)]
+
+def _alike(
+    values: Float[np.ndarray, "n K"],
+    difference: Float[np.ndarray, "p K"],
+    first: Integer[np.ndarray, " p"],
+    second: Integer[np.ndarray, " p"],
+) -> _Alike:
+    """Compare the values of a rule with the signs of the raters' own differences, 0 where they tell nothing apart."""
+    gap = values[first] - values[second]
+    near = np.abs(gap) <= 1e-12 * np.maximum(np.abs(values[first]), np.abs(values[second]))
+    told = (difference != 0) & np.isfinite(gap)
+    same = np.where(told, np.where(near, 0.5, np.sign(gap) == difference), 0.0)
+    return _Alike(same, told.astype(float), first, second, len(values))
 
 
 def _within(share: Estimate | None) -> Estimate | None:

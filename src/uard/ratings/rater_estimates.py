@@ -92,7 +92,7 @@ def answers_of(log: RatingLog) -> Answers:
         rating = np.concatenate([rating, before.rating])
     cell = item[row] * raters + rater
     count = np.bincount(cell, minlength=items * raters).astype(float)
-    total = np.bincount(cell, rating, items * raters)
+    total = np.bincount(cell, rating, items * raters).astype(float)  # of nothing it counts in whole numbers
     mean = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
     m2 = np.bincount(cell, (rating - mean[cell]) ** 2, items * raters).astype(float)
 

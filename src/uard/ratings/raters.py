@@ -148,7 +148,7 @@ class PanelSummary:
 
     def __str__(self) -> str:
         """Return a table, and what is known of all raters together."""
-        head = ("rater", "answers", "noise (95 %)", "bias (95 %)", "own view", "with others", "heard", "")
+        head = ("rater", "answers", "noise (95 %)", "bias (95 %)", "idiosyncrasy", "with others", "heard", "")
         rows = [
             (
                 r.name,
@@ -179,7 +179,7 @@ class PanelSummary:
 
 
 _NOTES = {
-    "o": "*o: too few repeated answers; from differences to other raters, own view included",
+    "o": "*o: too few repeated answers; from differences to other raters, idiosyncrasy included",
     "r": "*r: too few repeated answers and no other raters; spread about the reward, whose errors are included",
 }
 
