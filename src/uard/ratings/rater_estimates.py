@@ -188,14 +188,23 @@ class PanelEstimates:
         return units_of(self.with_reward)
 
     @cached_property
+    def main_unit(self) -> int:
+        """The reward's unit, or that of the most raters; -1 where all are in one."""
+        if self.units is None:
+            return -1
+        if self.rewarded and self.units[-1] >= 0:
+            return int(self.units[-1])
+        return int(np.argmax(np.bincount(self.units[self.units >= 0])))
+
+    @cached_property
     def comparable(self) -> Bool[np.ndarray, "K K"]:
-        """Which raters are not known to be in different units."""
+        """Which raters are in one unit; one whose unit is not known counts as in the main one."""
         raters = self.here.shape[1]
-        apart = np.zeros((raters, raters), bool)
+        same = np.ones((raters, raters), bool)
         if self.units is not None:
-            unit = self.units[:raters]
-            apart = (unit[:, None] >= 0) & (unit >= 0) & (unit[:, None] != unit)
-        return ~apart & ~np.eye(raters, dtype=bool)
+            unit = np.where(self.units < 0, self.main_unit, self.units)[:raters]
+            same = unit[:, None] == unit
+        return same & ~np.eye(raters, dtype=bool)
 
     @cached_property
     def statistics(self) -> RaterStatistics:
@@ -250,7 +259,7 @@ class PanelEstimates:
 
         From the variances of pairs' differences; who can be compared with one other rater only has half of theirs, and
         who can be compared with nobody has the robust variance about the reward (``own_variance``). NaN where nothing
-        is in common.
+        is in common, or the reward is in another unit.
         """
         a = self.answers.at(rows)
         both = shared(a.mean)
@@ -264,7 +273,8 @@ class PanelEstimates:
         known, reward = self.known[rows], a.reward
         for k in alone:
             mine = known & (a.count[:, k] > 0)
-            if reward is not None and mine.sum() >= TOGETHER:
+            same_unit = self.units is None or self.units[k] in (-1, self.main_unit)
+            if reward is not None and same_unit and mine.sum() >= TOGETHER:
                 gap = a.mean[mine, k] - reward[mine]
                 one = np.ones((len(gap), 1))
                 said = a.mean[mine, k] - np.median(gap)

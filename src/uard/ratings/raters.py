@@ -321,8 +321,8 @@ def _words(
 ) -> list[list[str]]:
     """Return what stands out of every rater."""
     unit = float(panel.statistics.scale)
-    sds = [x.value for x in noise if x is not None]
-    usual = float(np.median(sds)) if len(sds) > 2 else np.inf
+    sds = np.array([np.nan if x is None else x.value for x in noise])
+    alike = panel.comparable | np.eye(len(names), dtype=bool)  # of one unit
     odd = np.full(len(names), np.inf) if panel.rewarded else panel.odd
     copies, units = _copies(panel, names, unit), _other_units(panel, names)
     out: list[list[str]] = []
@@ -334,8 +334,11 @@ def _words(
         n, b, r = noise[k], bias[k], others[k]
         if r is not None and r.high is not None and r.high < 0:
             words.append("contrary")
-        elif n is not None and n.low is not None and n.low > usual and n.value > LOUDEST * usual and not constant:
-            words.append("noisy")
+        elif n is not None and n.low is not None and not constant:
+            others_too = sds[alike[k] & np.isfinite(sds)]
+            usual = float(np.median(others_too)) if others_too.size > 2 else np.inf
+            if n.low > usual and n.value > LOUDEST * usual:
+                words.append("noisy")
         sure = 0.0 if b is None or b.low is None or b.high is None else max(b.low, -b.high)
         if b is not None and min(sure, odd[k]) > SLIGHT * unit and not units[k]:
             words.append(f"biased by {b.value:.3g}")
@@ -368,8 +371,7 @@ def _other_units(panel: PanelEstimates, names: tuple[str, ...]) -> list[list[str
         if unit[-1] < 0:
             return out
     else:
-        groups = [np.flatnonzero(unit == u) for u in range(unit.max() + 1)]
-        to = min(groups, key=lambda g: (-len(g), min(names[k] for k in g)))
+        to = np.flatnonzero(unit == panel.main_unit)
         name = " and ".join(sorted(names[k] for k in to)[:3]) + (" and others" if len(to) > 3 else "")
     for k in range(len(names)):
         if unit[k] >= 0 and unit[k] != unit[to[0]]:
