@@ -189,12 +189,13 @@ class PanelEstimates:
 
     @cached_property
     def main_unit(self) -> int:
-        """The reward's unit, or that of the most raters; -1 where all are in one."""
+        """The reward's unit, or that of the most raters (of several such, the narrowest); -1 where all are in one."""
         if self.units is None:
             return -1
         if self.rewarded and self.units[-1] >= 0:
             return int(self.units[-1])
-        return int(np.argmax(np.bincount(self.units[self.units >= 0])))
+        number, spread = np.bincount(self.units[self.units >= 0]), self.with_reward.sd.diagonal()
+        return min(range(len(number)), key=lambda u: (-number[u], spread[self.units == u].min()))
 
     @cached_property
     def comparable(self) -> Bool[np.ndarray, "K K"]:
