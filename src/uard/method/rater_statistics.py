@@ -22,6 +22,7 @@ MOST = 4096  # state-actions over which statistics are taken; of more, these are
 CHI2_MEDIAN = 0.455  # of one degree of freedom
 ROUNDS = 5  # of Huber's iteration
 SOME = 0.1  # of the state-actions, at which a rater must be near the reward for a bias to be looked for there
+DRAWN = 4.0  # state-actions' worth of no bias that a bias is drawn towards
 LOUDEST = 2.0  # times the median deviation: who is noisier is not heard, among three raters or more
 
 
@@ -215,7 +216,7 @@ def robust_bias(
         total = xp.sum(weight, axis=0)
         mean = xp.sum(xp.where(here, weight * gap, zero), axis=0) / xp.where(total > 0, total, xp.ones_like(total))
         bias = xp.where(total > 0, mean, bias)
-    return bias * rated / (rated + 4.0)
+    return bias * rated / (rated + DRAWN)
 
 
 def own_variance(
