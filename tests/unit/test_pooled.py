@@ -20,8 +20,8 @@ from uard.ratings.aggregate import aggregate
 from . import pooled_reference as reference
 
 RULES = {
-    "pooled": PooledDiscounting(),
-    "pooled, 2 vetoes": PooledDiscounting(vetoes=2),
+    "uard": PooledDiscounting(),
+    "uard, 2 vetoes": PooledDiscounting(vetoes=2),
     "excess": ExcessDisagreement(),
     "witness": Witness(),
 }

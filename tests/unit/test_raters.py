@@ -290,7 +290,7 @@ def test_nobody_has_answered():
 
 def test_all_raters_excluded_is_as_if_nobody_had_rated():
     reward, said = np.array([4.0, 0.0, 0.0]), np.array([[-1.0, 2.0], [0.0, 0.0], [0.0, 0.0]])
-    feedback, rule = aggregate(said, reward), named("pooled")
+    feedback, rule = aggregate(said, reward), named("uard")
     fitted = rule.fit(feedback, feedback.count > 0)
     deaf = fitted._replace(raters=fitted.raters._replace(heard=0.0 * fitted.raters.heard))
     why = rule.explain(Evidence(reward, np.zeros(3), feedback), deaf)
