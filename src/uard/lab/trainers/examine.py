@@ -10,8 +10,8 @@ grids (``uard.replication.distortion``) where they can be:
 * The advantage of the agent's action over a random one (G13) is that of one step ahead, r + gamma V(s'), on the learned
   critics, with the reward of the random action's step raised by epsilon and then filtered.
 * A robot is kicked once (G10): 16 copies walk, and after step 50 the forward velocity is raised by 0, by 1, or by the
-  paper's 5. The paper kicks at step 500; there those of our agents that do their task have mostly fallen. What is said of
-  a step is the mean over the copies that still stand before it.
+  paper's 5. The paper kicks at step 500; there those of our agents that do their task have mostly fallen. What is said
+  of a step is the mean over the copies that still stand before it.
 """
 
 from __future__ import annotations
