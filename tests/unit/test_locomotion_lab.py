@@ -216,7 +216,8 @@ def test_what_is_said_around_a_kick_by_hand():
     walks = [kicks(stand).tolist(), kicks(fallen).tolist()]
     learning = np.stack([np.full((derive.BINS, 3), x) for x in (1.0, 2.0)]).tolist()
     metrics = {m: [1.0, 2.0] for m in METRICS}
-    cell = {"seeds": [0, 1], "metrics": metrics, "derived": {"kicked": walks, "learning": learning}}
+    derived = {"deterministic": [[1, 2], [3, 4]]}
+    cell = {"seeds": [0, 1], "metrics": metrics, "derived": derived | {"kicked": walks, "learning": learning}}
     p = Published(every(), [{"format": FORMAT, "cells": {r.cell.key: cell for r in study.rows}}])
     found = shown.around_kick(p, study.rows[0])
     assert found[5.0, "kick"]["standing"].tolist() == [0.75], "the seed that fell before is left out"
@@ -226,8 +227,9 @@ def test_what_is_said_around_a_kick_by_hand():
     (table,) = (t for t in shown.tables(p) if "with a kick" in t.title)
     assert len(table.rows) == 7 * len(study.rows)
     titles = [title for title, _, _ in shown.drawn(p)]
-    assert [t.split(" ")[0] for t in titles] == ["G6", "G7", "G10"]
-    other = Published(every(), [{"format": FORMAT, "cells": {r.cell.key: cell | {"derived": {}} for r in study.rows}}])
+    assert [t.split(" ")[0] for t in titles] == ["G6,", "G6,", "G6", "G7", "G10"]
+    bare = {r.cell.key: cell | {"derived": derived} for r in study.rows}
+    other = Published(every(), [{"format": FORMAT, "cells": bare}])
     assert shown.drifting(other) == [], "published for another study, without what this one derives"
 
 
