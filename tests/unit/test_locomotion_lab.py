@@ -227,7 +227,7 @@ def test_what_is_said_around_a_kick_by_hand():
     (table,) = (t for t in shown.tables(p) if "with a kick" in t.title)
     assert len(table.rows) == 7 * len(study.rows)
     titles = [title for title, _, _ in shown.drawn(p)]
-    assert [t.split(" ")[0] for t in titles] == ["G6,", "G6,", "G6", "G7", "G10"]
+    assert [t.split(" ")[0] for t in titles] == ["G6,", "G6,", "G6", "G7", "G10", "G10"]
     bare = {r.cell.key: cell | {"derived": derived} for r in study.rows}
     other = Published(every(), [{"format": FORMAT, "cells": bare}])
     assert shown.drifting(other) == [], "published for another study, without what this one derives"

@@ -24,7 +24,7 @@ DISTORTION, RATING = "mujoco-standard-distortion", "mujoco-standard-rating"
 BONUSES, ABLATION = "mujoco-standard-bonuses", "mujoco-standard-ablation"
 DRIFT = "mujoco-standard-drift"
 LEGITIMATE, CAUTION = "mujoco-standard-legitimate", "mujoco-standard-caution"
-WINDOWS = {"before": (25, 50), "kick": (50, 60), "later": (100, 150)}  # steps of a walk that is kicked after step 50
+WINDOWS = {"before": (25, 50), "kick": (50, 60), "later": (130, 150)}  # steps of a walk that is kicked after step 50
 AS_GOOD = 0.03  # by how much the AUROC of a cheaper sigma_m may be lower
 REFERENCES = ("raw", "true reward")
 REMOVED, KEPT, COST = 0.936, 0.9, 0.05  # the paper's best reduction (J16); what is asked of a filter beside it
@@ -305,7 +305,7 @@ def _around_kick(p: Published) -> Table:
         tuple(rows),
         4,
         "Trained agents, 16 copies of each seed, most likely actions, kicked after step 50. Before: steps 25 to 49; kick: 50 "
-        "to 59; later: 100 to 149. Standing: of the copies that stood when kicked. All else: per step, mean over the "
+        "to 59; later: 130 to 149. Standing: of the copies that stood when kicked. All else: per step, mean over the "
         "copies that still stand, so that what is said of later is said of those that did not fall. Raw agents ask nobody.",
     )  # fmt: skip
 
@@ -609,14 +609,16 @@ def _over_training(p: Published) -> list[tuple[str, str, Figure]]:
                 "the observed return rises and the true one falls."
             )
             made.append((f"{name} · {robot} over its training", note, figure))
-    rows = {r["mitigation"]: r for r in drifting(p, robot="hopper")}
-    if rows:
-        walks = {m: (p.derived(r, "kicked")[:, -1], COLOURS[m]) for m, r in rows.items()}
+    rows = drifting(p, robot="hopper")
+    for i, size in reversed([*enumerate(examine.KICKS)][1:] if rows else []):
+        walks = {r["mitigation"]: (p.derived(r, "kicked")[:, i], COLOURS[r["mitigation"]]) for r in rows}
         note = (
-            "5 m/s from behind after step 50 of an episode of the trained agent. Mean over the seeds of which a copy still "
-            "stands, and its 95 % interval; a line ends where fewer than two are left. Raw agents ask no raters."
+            f"{size:g} m/s from behind after step {examine.KICKED_AT} of an episode of the trained agent. Mean over the seeds "
+            "of which a copy still stands, and its 95 % interval; a line ends where fewer than two are left. Raw agents ask "
+            "no raters."
         )
-        made.append(("G10 · sigma_m and sigma_h along an episode with a kick, Hopper", note, figures.kicked(walks)))
+        title = f"G10 · sigma_m and sigma_h along an episode with a kick of {size:g} m/s, Hopper"
+        made.append((title, note, figures.kicked(walks)))
     return made
 
 
