@@ -267,8 +267,8 @@ def kicked(walks: dict[str, tuple[np.ndarray, str]]) -> Figure:
 
 
 def _interval(axis: Axes, x: np.ndarray, values: np.ndarray, label: str, colour: str) -> None:
-    """Draw the mean of (seeds, points), NaN where a seed says nothing, and its interval where two seeds or more do."""
-    drawn = (np.isfinite(values).sum(0) > 1).nonzero()[0]
+    """Draw the mean of (seeds, points) and its interval where two seeds or more are no NaN; one seed as it is."""
+    drawn = (np.isfinite(values).sum(0) >= min(2, len(values))).nonzero()[0]
     found = [statistics.summarise(values[np.isfinite(values[:, i]), i]) for i in drawn]
     low, high = np.array([s.ci95 for s in found]).reshape(-1, 2).T
     axis.plot(x[drawn], [s.mean for s in found], color=colour, lw=2, label=label)
