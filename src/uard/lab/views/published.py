@@ -179,9 +179,9 @@ class Published:
         """Return the keys of all published cells."""
         return tuple(self._cells)
 
-    def has(self, row: Row) -> bool:
-        """Whether a row was published."""
-        return row.cell.key in self._cells
+    def has(self, row: Row, derived: str = "") -> bool:
+        """Whether a row was published, and, if a name is given, this derived from it."""
+        return row.cell.key in self._cells and (not derived or derived in self._cell(row).get("derived", {}))
 
     def rows(self, study: str, **labels: Any) -> list[Row]:
         """Return the published rows of a study with these labels."""
