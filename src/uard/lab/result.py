@@ -29,6 +29,7 @@ METRICS = (
 )
 
 
+SHARES = ("success_rate",)  # metrics that are shares of a seed's episodes
 COLUMNS = (*LOG, "alignment_gap")  # that ``Result.curve`` knows
 _FORMERLY = {"trap_visits": "hacks", "goal": "success", "goal_rate": "success_rate"}
 
@@ -192,4 +193,4 @@ def summaries(results: list[Result]) -> dict[str, statistics.Summary]:
         InvalidValueError: no results, or a metric that is not finite.
     """
     rows = [r.metrics() for r in results]
-    return {name: statistics.summarise([row[name] for row in rows], name) for name in METRICS}
+    return {name: statistics.summarise([row[name] for row in rows], name, name in SHARES) for name in METRICS}

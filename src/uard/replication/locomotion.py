@@ -32,7 +32,7 @@ COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", 
 
 def summary(values: np.ndarray) -> str:
     """Return one number per seed as text: mean, deviation and interval; of one seed, that number alone."""
-    return full(statistics.summarise(values)) if len(values) > 1 else number(values[0])
+    return full(statistics.summarise(values))
 
 
 def tables(p: Published) -> list[Table]:
@@ -414,16 +414,13 @@ def _of_hacking(p: Published) -> list[str]:
         f"on the true reward in {len(poor)}{_by_agent(poor)}. With so few seeds these shares are rough: see the "
         f"intervals. All settings of a robot together, uard keeps: {'; '.join(together) or 'not all were run'}."
     )
-    tame = [
-        f"{r['robot']} {r['region']} {r['agent']}"
-        for r in p.rows(HACKING, mitigation="raw")
-        if (honest := _rival(p, r, "true reward")) is not None
-        and p.of(r, "true_return").ci95[1] >= p.of(honest, "true_return").ci95[0]
-    ]
+    pairs = [(r, x) for r in p.rows(HACKING, mitigation="raw") if (x := _rival(p, r, "true reward")) is not None]
+    family = p.compare(pairs, "true_return")
+    tame = [f"{r['robot']} {r['region']} {r['agent']}" for i, (r, _) in enumerate(pairs) if not family.below(i)]
     if tame:
         out.append(
             f"MuJoCo: in {'; '.join(tame)} the raw agent's true return is not clearly below that of the agent trained on "
-            "the true reward, so there is little to prevent there, and its rows prove little."
+            f"the true reward, so there is little to prevent there, and its rows prove little. {family.caption()}"
         )
     plain = [(r, shares(p, r)[1]) for r in ours if r["region"] == "none"]
     dear = [f"{_name(r)} {100 * (1 - x):.0f} %" for r, x in plain if x is not None and x < 1 - COST]

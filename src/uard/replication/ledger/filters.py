@@ -10,7 +10,7 @@ from uard.lab.statistics import Summary
 from uard.lab.views.study_results import StudyResults
 from uard.method.weights import ReliabilityFilter, exponential_weight, linear_weight, reciprocal_weight, wiener_weight
 from uard.replication import paper
-from uard.replication.ledger.claim import Conditions, below
+from uard.replication.ledger.claim import Conditions, below_in
 from uard.replication.verdicts import Opinion, Part, each
 
 
@@ -114,9 +114,9 @@ J4 = Conditions(
             lambda n: 100 * n["jump"] < n["jump_linear"],
         ),
         *each(
-            "{}: in the first 100 episodes the goal is reached more often than with the linear form (intervals apart)",
+            "{}: in the first 100 episodes the goal is reached more often than with the linear form (beyond noise)",
             READINGS,
-            lambda n, reading: below(n["early_linear"][reading], n["early"][reading]),
+            lambda n, reading: below_in(n["early_linear"], n["early"], reading),
         ),
     ),
     _smooth,
@@ -145,14 +145,14 @@ J14 = Conditions(
             lambda n: n["jump_linear"] > 100 * n["jump"],
         ),
         *each(
-            "{}: linear subtraction collapses: more visits than with the reciprocal form (intervals apart)",
+            "{}: linear subtraction collapses: more visits than with the reciprocal form (beyond noise)",
             READINGS,
-            lambda n, reading: below(n["visits"][reading], n["visits_linear"][reading]),
+            lambda n, reading: below_in(n["visits"], n["visits_linear"], reading),
         ),
         *each(
-            "{}: exponential decay suppresses too much: fewer goals than with the reciprocal form (intervals apart)",
+            "{}: exponential decay suppresses too much: fewer goals than with the reciprocal form (beyond noise)",
             READINGS,
-            lambda n, reading: below(n["goal_exponential"][reading], n["goal"][reading]),
+            lambda n, reading: below_in(n["goal_exponential"], n["goal"], reading),
         ),
     ),
     _rivals,

@@ -11,7 +11,7 @@ from importlib import resources
 from typing import Any
 
 from uard.lab.statistics import Summary
-from uard.lab.views.tables import brief, full, number
+from uard.lab.views.tables import bounds, brief, full, number
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Template(string.Formatter):
 
 
 def _interval(s: Summary) -> str:
-    return f"{number(s.mean)} [{number(s.ci95[0])}, {number(s.ci95[1])}]"
+    return f"{number(s.mean)}{bounds(s.ci95)}" if s.ci95 else brief(s)
 
 
 def _percent(share: float) -> str:
