@@ -425,7 +425,7 @@ class Family:
     detectable: tuple[float, ...]
 
     @property
-    def count(self) -> int:
+    def compared(self) -> int:
         """How many comparisons there are."""
         return sum(t is not None for t in self.tests)
 
@@ -449,11 +449,11 @@ class Family:
             >>> compare_all([([1.0, 2.0, 3.1], [2.0, 3.0, 4.0])]).caption()
             '1 comparison: 0.1 would differ by chance at 5 % uncorrected, 1 do uncorrected, 1 after Holm correction.'
         """
-        if not self.count:
+        if not self.compared:
             return "Nothing is compared: there is one run of each."
         uncorrected = sum(t is not None and t.p < LEVEL for t in self.tests)
         text = (
-            f"{self.count} comparison{'s' * (self.count > 1)}: {LEVEL * self.count:.1f} would differ by chance at 5 % "
+            f"{self.compared} comparison{'s' * (self.compared > 1)}: {LEVEL * self.compared:.1f} would differ by chance at 5 % "
             f"uncorrected, {uncorrected} do uncorrected, {len(self.found)} after Holm correction."
         )
         spread = [d for d in self.detectable if d > 0]
@@ -471,7 +471,7 @@ def compare_all(pairs: Iterable[tuple[object, object]], shared: bool = True) -> 
     Examples:
         >>> one, other = [1.0, 2.0, 3.1], [0.0, 1.0, 2.0]
         >>> family = compare_all([(one, other), (other, [2.0, 0.0, 1.0]), (one[:1], other[:1])])
-        >>> family.count, family.found, [round(p, 4) for p in family.adjusted]
+        >>> family.compared, family.found, [round(p, 4) for p in family.adjusted]
         (2, (0,), [0.0021, 1.0, 1.0])
 
     Args:
