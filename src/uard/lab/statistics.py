@@ -453,8 +453,8 @@ class Family:
             return "Nothing is compared: there is one run of each."
         uncorrected = sum(t is not None and t.p < LEVEL for t in self.tests)
         text = (
-            f"{self.compared} comparison{'s' * (self.compared > 1)}: {LEVEL * self.compared:.1f} would differ by chance at 5 % "
-            f"uncorrected, {uncorrected} do uncorrected, {len(self.found)} after Holm correction."
+            f"{self.compared} comparison{'s' * (self.compared > 1)}: {LEVEL * self.compared:.1f} would differ by chance at "
+            f"5 % uncorrected, {uncorrected} do uncorrected, {len(self.found)} after Holm correction."
         )
         spread = [d for d in self.detectable if d > 0]
         if self.found or not spread:
