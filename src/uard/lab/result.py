@@ -185,9 +185,9 @@ def summaries(results: list[Result]) -> dict[str, statistics.Summary]:
     """Summarise every metric over seeds.
 
     Examples:
-        >>> seeds = [Result(np.full((1, 6), x), steps=1, path=np.array([0]), extra={}) for x in (1.0, 3.0)]
+        >>> seeds = [Result(np.full((1, 6), x), steps=1, path=np.array([0]), extra={}) for x in (0.5, 1.0)]
         >>> summaries(seeds)["hacks"].per_seed
-        (1.0, 3.0)
+        (0.5, 1.0)
 
     Raises:
         InvalidValueError: no results, or a metric that is not finite.

@@ -452,8 +452,9 @@ class Family:
         if not self.compared:
             return "Nothing is compared: there is one run of each."
         uncorrected = sum(t is not None and t.p < LEVEL for t in self.tests)
+        what = "comparison" if self.compared == 1 else "comparisons"
         text = (
-            f"{self.compared} comparison{'s' * (self.compared > 1)}: {LEVEL * self.compared:.1f} would differ by chance at "
+            f"{self.compared} {what}: {LEVEL * self.compared:.1f} would differ by chance at "
             f"5 % uncorrected, {uncorrected} do uncorrected, {len(self.found)} after Holm correction."
         )
         spread = [d for d in self.detectable if d > 0]
