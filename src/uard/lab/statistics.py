@@ -457,6 +457,9 @@ class Family:
             f"{self.compared} {what}: {LEVEL * self.compared:.1f} would differ by chance at "
             f"5 % uncorrected, {uncorrected} do uncorrected, {len(self.found)} after Holm correction."
         )
+        larger = sum(t is not None and t.p < LEVEL and t.difference > 0 for t in self.tests)
+        if uncorrected > len(self.found):  # which correction hides: a reader must see in whose favour
+            text = f"{text} Of the {uncorrected}, the first of the two is larger in {larger}."
         spread = [d for d in self.detectable if d > 0]
         if self.found or not spread:
             return text

@@ -416,7 +416,11 @@ def _of_hacking(p: Published) -> list[str]:
     )
     pairs = [(r, x) for r in p.rows(HACKING, mitigation="raw") if (x := _rival(p, r, "true reward")) is not None]
     family = p.compare(pairs, "true_return")
-    tame = [f"{r['robot']} {r['region']} {r['agent']}" for i, (r, _) in enumerate(pairs) if not family.below(i)]
+    tame = [
+        f"{r['robot']} {r['region']} {r['agent']}"
+        for i, (r, _) in enumerate(pairs)
+        if family.tests[i] and not family.below(i)
+    ]
     if tame:
         out.append(
             f"MuJoCo: in {'; '.join(tame)} the raw agent's true return is not clearly below that of the agent trained on "

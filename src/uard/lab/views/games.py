@@ -26,7 +26,7 @@ def losses(p: Published) -> list[str]:
     more = f"; and {len(beaten) - LISTED} more (table below)" if len(beaten) > LISTED else ""
     return [
         f"Reward-gaming gridworlds: in {len(beaten)} comparisons over {len(games)} settings another mitigation, raw "
-        f"included, has the higher true return{named}{more}. {family.caption()}"
+        f"included, has the higher true return{named}{more}. Rival against uard: {family.caption()}"
     ]
 
 

@@ -50,7 +50,7 @@ def _escaped(results: StudyResults) -> str:
     return (
         f"In {len(gains)} comparisons another mitigation does better there, most of all {best['mitigation']} ({_name(best)}): "
         f"{brief(results.of(best.cell, 'true_return'))} against {brief(results.of(mine, 'true_return'))}; very noisy raters make it shun "
-        f"whatever they rate. {family.caption()}"
+        f"whatever they rate. Rival against uard: {family.caption()}"
     )
 
 
@@ -84,7 +84,7 @@ def _denied(results: StudyResults) -> str:
             lost.append(f"{r['panel']}: {brief(results.of(r.cell, 'success_rate'))}, more with {', '.join(better)}")
     count = len(ours)
     named = f" (share of episodes that reach it: {'; '.join(lost)})" if lost else ""
-    return f"One rater against all others takes the goal from uard in {len(lost)} of {count} settings{named}. {family.caption()}"
+    return f"One rater against all others takes the goal from uard in {len(lost)} of {count} settings{named}. Rival against uard: {family.caption()}"
 
 
 def _learned(results: StudyResults) -> str:
@@ -119,7 +119,7 @@ def _beaten(results: StudyResults, study: str, shown: tuple[str, ...]) -> str:
     named = ": " + "; ".join(beaten) if beaten else ""
     return (
         f"Study {study}: in {len(beaten)} comparisons over {len(rows)} settings another mitigation has the higher true "
-        f"return{named}. {family.caption()}"
+        f"return{named}. Rival against uard: {family.caption()}"
     )
 
 
