@@ -139,8 +139,8 @@ class Run:
             (
                 name.replace("_", " "),
                 f"{s.mean:.3f}",
-                f"{s.sd:.3f}",
-                f"{s.ci95[0]:.3f} .. {s.ci95[1]:.3f}",
+                f"{s.sd:.3f}" if s.ci95 else "–",
+                f"{s.ci95[0]:.3f} .. {s.ci95[1]:.3f}" if s.ci95 else "one run",
                 f"{s.iqm:.3f}",
             )
             for name, s in metrics.items()

@@ -51,7 +51,7 @@ def filters(results: StudyResults) -> Figure:
         s = [results.get("filters", "success_rate", form=f, reading=reading) for f in forms]
         place = np.arange(len(forms)) + (i - 1) * 0.26
         right.bar(place, [x.mean for x in s], 0.24, color=COLOURS[reading], label=reading)
-        low, high = np.array([[x.mean - x.ci95[0], x.ci95[1] - x.mean] for x in s]).T
+        low, high = np.abs(np.transpose([x.ci95 or (x.mean, x.mean) for x in s]) - [x.mean for x in s])
         right.errorbar(place, [x.mean for x in s], np.stack([low, high]), fmt="none", color="k", lw=1)
     right.set_xticks(range(len(forms)), [f.replace("certainty-equivalent", "certainty\nequivalent") for f in forms])
     right.set(ylabel="goal rate, 6x6", title="Where the form acts, by reading", ylim=(0, 1.25))

@@ -35,7 +35,7 @@ COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", 
 
 def summary(values: np.ndarray) -> str:
     """Return one number per seed as text: mean, deviation and interval; of one seed, that number alone."""
-    return full(statistics.summarise(values)) if len(values) > 1 else number(values[0])
+    return full(statistics.summarise(values))
 
 
 def tables(p: Published) -> list[Table]:
@@ -486,11 +486,12 @@ def _as_honest(p: Published, rows: list[Row]) -> int:
 
 
 def _of_tame(p: Published) -> list[str]:
+    pairs = [(r, x) for r in p.rows(HACKING, mitigation="raw") if (x := _rival(p, r, "true reward")) is not None]
+    family = p.compare(pairs, "true_return")
     tame = [
         f"{r['robot']} {r['region']} {r['agent']}"
-        for r in p.rows(HACKING, mitigation="raw")
-        if (honest := _rival(p, r, "true reward")) is not None
-        and p.of(r, "true_return").ci95[1] >= p.of(honest, "true_return").ci95[0]
+        for i, (r, _) in enumerate(pairs)
+        if family.tests[i] and not family.below(i)
     ]
     if not tame:
         return []

@@ -33,7 +33,7 @@ from uard.lab import statistics
 from uard.lab.cell import Cell
 from uard.lab.config import FORMAT
 from uard.lab.execution.store import Store
-from uard.lab.result import Result, check_name
+from uard.lab.result import SHARES, Result, check_name
 from uard.lab.statistics import Summary
 from uard.lab.study import Row, Study
 from uard.plugins import Plugin, PluginError, brought
@@ -209,7 +209,19 @@ class Published:
 
     def of(self, row: Row, metric: str) -> Summary:
         """Return a metric's summary."""
-        return statistics.summarise(self.per_seed(row, metric), metric)
+        return statistics.summarise(self.per_seed(row, metric), metric, metric in SHARES)
+
+    def compare(self, pairs: Sequence[tuple[Row, Row]], metric: str) -> statistics.Family:
+        """Test a metric of each pair of rows on the seeds that both have, paired; corrected for the number of pairs."""
+        found = []
+        for rows in pairs:
+            one, other = (dict(zip(self.seeds_of(r), self.per_seed(r, metric), strict=True)) for r in rows)
+            shared = [seed for seed in one if seed in other]
+            if len(shared) < 2:  # with seeds of their own they are compared as they are
+                found.append((list(one.values()), list(other.values())))
+            else:
+                found.append(([one[s] for s in shared], [other[s] for s in shared]))
+        return statistics.compare_all(found)
 
     def per_seed(self, row: Row, metric: str) -> np.ndarray:
         """Return a metric, one number per seed."""

@@ -18,7 +18,7 @@ from uard.method.weights import (
     wiener_weight,
 )
 from uard.replication import paper
-from uard.replication.ledger.claim import Conditions, below
+from uard.replication.ledger.claim import Conditions, below_in
 from uard.replication.verdicts import Opinion, Part, each
 
 
@@ -129,9 +129,9 @@ J4 = Conditions(
             lambda n: 100 * n["jump"] < n["jump_linear"],
         ),
         *each(
-            "{}: in the first 100 episodes the goal is reached more often than with the linear form (intervals apart)",
+            "{}: in the first 100 episodes the goal is reached more often than with the linear form (beyond noise)",
             READINGS,
-            lambda n, reading: below(n["early_linear"][reading], n["early"][reading]),
+            lambda n, reading: below_in(n["early_linear"], n["early"], reading),
         ),
     ),
     _smooth,
@@ -157,14 +157,14 @@ J14 = Conditions(
             lambda n: n["jump_linear"] > 100 * n["jump"],
         ),
         *each(
-            "{}: linear subtraction collapses: more visits than with the reciprocal form (intervals apart)",
+            "{}: linear subtraction collapses: more visits than with the reciprocal form (beyond noise)",
             READINGS,
-            lambda n, reading: below(n["visits"][reading], n["visits_linear"][reading]),
+            lambda n, reading: below_in(n["visits"], n["visits_linear"], reading),
         ),
         *each(
-            "{}: exponential decay suppresses too much: fewer goals than with the reciprocal form (intervals apart)",
+            "{}: exponential decay suppresses too much: fewer goals than with the reciprocal form (beyond noise)",
             READINGS,
-            lambda n, reading: below(n["goal_exponential"][reading], n["goal"][reading]),
+            lambda n, reading: below_in(n["goal_exponential"], n["goal"], reading),
         ),
     ),
     _rivals,
@@ -311,20 +311,20 @@ A30 = Conditions(
         ),
         *each(
             "{}: squared uncertainty suppresses exploration: in the first 100 episodes it reaches the goal less often "
-            "(intervals apart)",
+            "(paired, Holm)",
             READINGS,
-            lambda n, reading: below(n["early_squared"][reading], n["early"][reading]),
+            lambda n, reading: below_in(n["early_squared"], n["early"], reading),
         ),
         *each(
             "{}: squared uncertainty is unstable: a larger SD of the true return over the last hundred episodes "
-            "(intervals apart)",
+            "(paired, Holm)",
             READINGS,
-            lambda n, reading: below(n["spread"][reading], n["spread_squared"][reading]),
+            lambda n, reading: below_in(n["spread"], n["spread_squared"], reading),
         ),
         *each(
-            "{}: the linear form discounts what it should: fewer visits of the trap (intervals apart)",
+            "{}: the linear form discounts what it should: fewer visits of the trap (paired, Holm)",
             READINGS,
-            lambda n, reading: below(n["visits"][reading], n["visits_squared"][reading]),
+            lambda n, reading: below_in(n["visits"], n["visits_squared"], reading),
         ),
         Opinion("the paper shows a comparison of both, discrete or continuous", False),
     ),

@@ -10,7 +10,7 @@ from uard.lab import statistics
 from uard.lab.statistics import Summary
 from uard.lab.views.study_results import StudyResults
 from uard.replication import paper
-from uard.replication.ledger.claim import Conditions, agrees, below, reduction
+from uard.replication.ledger.claim import Conditions, above_zero, agrees, below, reduction
 from uard.replication.ledger.tables import SIZES
 from uard.replication.studies.grids import PANELS
 from uard.replication.verdicts import Opinion, Part, each
@@ -348,7 +348,7 @@ L1945 = Conditions(
         Part(
             "the multi-head agent is more stable: the SD of its true return over the last hundred episodes is lower "
             "(interval of the difference above 0)",
-            lambda n: n["steadier"].ci95[0] > 0,
+            lambda n: above_zero(n["steadier"]),
         ),
         Part(
             "and prone to drops: its worst episode is as low as printed",
