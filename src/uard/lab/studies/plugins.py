@@ -80,13 +80,15 @@ def compared_with(studies: Iterable[Study], others: Iterable[str]) -> tuple[Stud
         InvalidValueError: none of the studies compares mitigations, or a name is no mitigation.
     """
     studies, added = tuple(studies), {name: named(name) for name in dict.fromkeys(others)}
+    if not added:
+        return studies  # whose rows need not be built
     recommended, grown = named("uard"), []
     for study in studies:
         places = [r for r in study.where(mitigation="uard") if r.cell.mitigation == recommended]
         new = [_instead(r, name, r.cell.with_(mitigation=m)) for name, m in added.items() for r in places]
         have = {r.labels for r in study.rows}
         grown.append(replace(study, rows=(*study.rows, *(r for r in new if r.labels not in have))))
-    if added and not any(any(s.where(mitigation="uard")) for s in studies):
+    if not any(any(s.where(mitigation="uard")) for s in studies):
         allowed = f"left out: none of {', '.join(s.name for s in studies)} compares mitigations"
         raise _checks.InvalidValueError("mitigation", ", ".join(added), allowed)
     return tuple(grown)
