@@ -136,7 +136,9 @@ class Study:
             for i, value in enumerate(getattr(self, name)):
                 check_name(f"{name}[{i}]", value, known)
         if self.brief and (self.curves or self.derive):
-            raise _checks.InvalidValueError("brief", self.brief, "left out where curves or derived numbers are published")
+            raise _checks.InvalidValueError(
+                "brief", self.brief, "left out where curves or what is derived is published"
+            )
 
     def jobs(self, seeds: Iterable[int]) -> list[tuple[Cell, int]]:
         """Return every (cell, seed), the seeds of a cell side by side so that it finishes as a whole."""

@@ -1,7 +1,7 @@
 """Raters whom nobody has tuned anything on: random panels on random grids and random decision problems.
 
-Scenario n is ``random_grid(n)`` or ``RandomMDP(seed=n)``, rated by ``random_panel(n)`` on a share ``random_share(n)`` of
-the steps. Scenarios of the study ``panels-development`` may be tuned on (``is_for_development``); those of ``panels``,
+Scenario n is ``random_grid(n)`` or ``RandomMDP(seed=n)``, rated by ``random_panel(n)`` on ``random_share(n)`` of the
+steps. Scenarios of the study ``panels-development`` may be tuned on (``is_for_development``); those of ``panels``,
 which are reported, may not.
 """
 
@@ -62,7 +62,7 @@ def scenario(tasks: str, seed: int) -> Scenario:
     Examples:
         >>> drawn = scenario(GRIDS, 7)
         >>> drawn.environment.size, len(drawn.panel.raters), drawn.rated
-        (8, 7, 1.0)
+        (9, 7, 1.0)
 
     Args:
         tasks: ``GRIDS`` or ``MDPS``.

@@ -183,12 +183,14 @@ class Published:
             InvalidValueError: something of another format of keys, or that is no published results.
         """
         self.studies = {s.name: s for s in studies}
-        self.sources = [{k: v for k, v in f.items() if k not in ("cells", "brief")} for f in files]
+        self.sources: list[dict[str, Any]] = []
         self._cells: dict[str, Any] = {}
         for f in files:
+            _checks.instance("published", f, dict, "what `uard reproduce --extract` wrote")
             if _format_of(f) != FORMAT:
                 raise _checks.InvalidValueError("format", _format_of(f), f"{FORMAT}: {MIGRATE}")
             self._cells |= cells_of(f)
+            self.sources.append({k: v for k, v in f.items() if k not in ("cells", "brief")})
 
     @property
     def cells(self) -> tuple[str, ...]:
@@ -249,6 +251,19 @@ class Published:
     def derived(self, row: Row, name: str) -> np.ndarray:
         """Return something derived, one entry per seed."""
         return self._numbers(row, "derived", name)
+
+
+def read_file(path: str) -> Any:
+    """Return what ``uard reproduce --extract`` wrote.
+
+    Raises:
+        InvalidValueError: it cannot be read.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        allowed = f"a file that `uard reproduce --extract` wrote ({error})"
+        raise _checks.InvalidValueError("published", path, allowed) from None
 
 
 def cells_of(data: Any) -> dict[str, Any]:
@@ -342,7 +357,7 @@ def broken() -> list[PluginError]:
     return brought("results", _checked)[1]
 
 
-_OWN = ResultFiles(resources.files("uard.lab.published"), ("games.json",))
+_OWN = ResultFiles(resources.files("uard.lab.published"), ("games.json",))  # and panels.json, once it is there
 
 
 def _places() -> list[ResultFiles]:
