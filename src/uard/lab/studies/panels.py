@@ -39,7 +39,6 @@ SCALE = 0.3
 """Of a panel that rates a random MDP. Biases, noise and ranges of ``random_panel`` are in units of a grid whose goal
 pays 10; the largest reward that is meant of a random MDP is a prize of 3."""
 PUBLISHED = ("true_return", "hacks", "success_rate")
-SEEDS = 4  # of each cell, that the report is made from
 
 
 class Scenario(NamedTuple):
