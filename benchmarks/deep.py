@@ -136,7 +136,7 @@ def main() -> None:
         "5 heads, shared trunk": (ours("shared", 5, "raw"), 10, flops(0, 4, 5, "shared")),
         "5 full networks": (ours("full", 5, "raw"), 10, flops(0, 4, 5, "full")),
         "dropout, 5 passes": (ours("dropout", 5, "raw"), 10, flops(0, 4, 1, "full")),
-        "5 heads with uard and a model of the ratings": (ours("shared", 5, "uard"), 10, flops(0, 4, 5, "shared")),
+        "5 heads with uard and a model of the ratings": (ours("shared", 5, "uard-0.1"), 10, flops(0, 4, 5, "shared")),
     }
     for name, (run, factor, _) in contenders.items():
         print(f"compiling and warming up: {name}", flush=True)

@@ -68,7 +68,7 @@ def listing(cells: int, folder: Path) -> dict[str, Any]:
     path = folder / "many.sqlite"
 
     def study() -> Study:
-        rows = (Row((("lam", i),), Cell(mitigation=named("uard", lam=i / 1000))) for i in range(cells))
+        rows = (Row((("lam", i),), Cell(mitigation=named("uard-0.1", lam=i / 1000))) for i in range(cells))
         return Study("many", "Many cells", "", tuple(rows))
 
     with closing(Store(path)) as store:

@@ -102,7 +102,7 @@ def main() -> None:
     for label, one in (
         ("learned from the true reward", job("raw", reference=True)),
         ("learned from the reward that lies", job("raw")),
-        ("the same, with uard", job("uard")),
+        ("the same, with uard", job("uard-0.1")),
     ):
         *_, (state, act) = trained(one)
         keep(label, filmed(one, state, act))

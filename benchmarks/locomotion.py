@@ -243,14 +243,14 @@ def main() -> None:
             **({"SBX, 2 critics": (their_sac("sbx", 400), sac_flops(2, False))} if util.find_spec("sbx") else {}),
             "ours, 2 critics": (our_sac(two, "raw", 500), sac_flops(2, False)),
             "ours, 5 shared critics, raw": (our_sac(five, "raw", 500), sac_flops(5, True)),
-            "ours, 5 shared critics, uard": (our_sac(five, "uard", 500), sac_flops(5, True)),
-            "ours, 5 full critics, uard": (our_sac(full, "uard", 300), sac_flops(5, False)),
+            "ours, 5 shared critics, uard": (our_sac(five, "uard-0.1", 500), sac_flops(5, True)),
+            "ours, 5 full critics, uard": (our_sac(full, "uard-0.1", 300), sac_flops(5, False)),
         }
     if "ppo" in arguments.only:
         every["PPO: environment steps per CPU-second, one core"] = {
             "Stable-Baselines3": (their_ppo(1), 0.0),
             "ours, raw": (our_ppo("raw", 2), 0.0),
-            "ours, uard": (our_ppo("uard", 2), 0.0),
+            "ours, uard": (our_ppo("uard-0.1", 2), 0.0),
         }
     rows = []
     for title, contenders in every.items():

@@ -39,7 +39,7 @@ assert runner.run(jobs, Store(sys.argv[1])) == 0
 
 
 def cells(count: int) -> list[Cell]:
-    return [Cell(mitigation=named("uard", lam=1 + i / 1000)) for i in range(count)]
+    return [Cell(mitigation=named("uard-0.1", lam=1 + i / 1000)) for i in range(count)]
 
 
 def fill(path: Path, count: int, seeds: int) -> None:

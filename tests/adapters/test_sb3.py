@@ -170,7 +170,7 @@ def test_tensorboard_gets_the_scalars(tmp_path):
 
 
 def test_what_was_learned_is_saved_and_loaded(tmp_path):
-    env = ReliabilityVecEnv(grids(2), named("uard", lam=0.3))
+    env = ReliabilityVecEnv(grids(2), named("uard-0.1", lam=0.3))
     env.reset()
     random = np.random.default_rng(0)
     for _ in range(100):
@@ -178,7 +178,7 @@ def test_what_was_learned_is_saved_and_loaded(tmp_path):
     env.save(tmp_path / "stream.npz")
     again = ReliabilityVecEnv.load(tmp_path / "stream.npz", grids(2))
     assert again.steps.stream.rated == 200
-    assert again.steps.stream.mitigation == named("uard", lam=0.3)
+    assert again.steps.stream.mitigation == named("uard-0.1", lam=0.3)
     (tmp_path / "other.pkl").write_bytes(pickle.dumps([1]))
     with pytest.raises(InvalidValueError, match=r"path = .*other.pkl.*: must be a file that save wrote"):
         ReliabilityVecEnv.load(tmp_path / "other.pkl", grids(2))

@@ -38,7 +38,7 @@ from uard.adapters.trl import (
     groups_of,
     keeps_factor,
 )
-from uard.method.mitigations import named, uard
+from uard.method.mitigations import named, uard_0_1
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "grpo_three_judges.py"
 
@@ -516,7 +516,7 @@ def nothing(**kwargs):
         ([broken, nothing], {"timeout": {"nothin": 1}}, "did you mean 'nothing'"),
         ([broken, nothing], {"timeout": {"sigma_m": 1}}, "name of a judge in timeout = 'sigma_m'"),
         ([broken, nothing], {"name": "[b]"}, r"name = '\[b\]': must be a text of 1 to 100 printable"),
-        ([broken, nothing], {"mitigation": uard}, "mitigation = "),
+        ([broken, nothing], {"mitigation": uard_0_1}, "mitigation = "),
         ([broken, nothing], {"sigma_m": 0.3}, "sigma_m = 0.3: must be a function"),
         ([broken, nothing], {"mitigation": named("uard-paper")}, "mitigation.acts_on = 'score'"),
     ],
@@ -597,7 +597,7 @@ def test_a_factor_is_lost_where_groups_are_divided_and_only_there(tmp_path):
     def doubted():
         ensemble = says([20.0] * 4 + [0.0] * 4)  # the first prompt is doubted, not its completions
         scores = list(range(8))
-        mitigation = uard(anchor="zero", prior_count=0.0)
+        mitigation = uard_0_1(anchor="zero", prior_count=0.0)
         return UncertaintyDiscountedReward(panel(scores, scores), sigma_m=ensemble, mitigation=mitigation)
 
     with pytest.warns(DiscountCancelledWarning, match="scale_rewards='batch' or 'none'") as caught:

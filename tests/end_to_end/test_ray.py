@@ -50,7 +50,7 @@ def walks(n):
 
 
 def small(mitigation=None):
-    return Cell(GRID, mitigation or named("uard"), episodes=30)
+    return Cell(GRID, mitigation or named("uard-0.1"), episodes=30)
 
 
 @dataclass(frozen=True)

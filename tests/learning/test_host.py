@@ -40,7 +40,7 @@ LIES = Locomotion("hopper", region=Vibration(shaking=0.5, speed=5.0), kick=Kick(
 SMALL = TransitionModel(hidden=8, fits=5, batch=16, capacity=64)
 
 
-def job(agent, mitigation="uard", steps=1024, **changes):
+def job(agent, mitigation="uard-0.1", steps=1024, **changes):
     return Job(LIES, AGENTS[agent], named(mitigation), 1, steps, rating_model=SMALL, evaluations=2, **changes)
 
 
@@ -57,7 +57,7 @@ def same(a, b):
 
 @pytest.mark.parametrize(
     ("agent", "mitigation"),
-    [*((agent, "uard") for agent in AGENTS), ("ppo", "raw"), ("ppo", "uard-paper"), ("sac", "screening")],
+    [*((agent, "uard-0.1") for agent in AGENTS), ("ppo", "raw"), ("ppo", "uard-paper"), ("sac", "screening")],
 )
 def test_every_agent_runs_with_every_kind_of_mitigation(agent, mitigation):
     done = run(job(agent, mitigation, 256))
@@ -279,13 +279,13 @@ def test_a_difference_counts_as_far_as_it_is_more_than_its_deviation():
 def test_the_anchor_of_a_predicted_step_is_the_prediction_however_little_it_is_worth():
     columns = [[1.0, 5.0], [0.0, 0.0], [-2.0, 3.0], [1.0, 1.0], [4.0, 4.0], [3.0, 3.0]]
     f = Feedback(*map(jax.numpy.array, columns))
-    for m in (named("uard"), named("worst-of-annotations")):
+    for m in (named("uard-0.1"), named("worst-of-annotations")):
         statistics = m.fit(f, jax.numpy.ones(2, bool))
         assert float(statistics.lowest) == 0.5
         expected = transitions.expecting(statistics, f)
         np.testing.assert_array_equal(expected.lowest, f.lowest)
         assert expected.scale is statistics.scale
-    uard = named("uard")
+    uard = named("uard-0.1")
     anchor = uard.reward_anchor(f.proxy, f, transitions.expecting(uard.fit(f, f.count > 0), f))
     np.testing.assert_allclose(anchor, [-2.0, 3.0], rtol=1e-6)
     assert transitions.expecting((), f) == ()

@@ -149,6 +149,6 @@ def test_the_plain_agent_solves_an_honest_grid(name):
     ("name", "trap", "panel"), [*((name, 4.0, "main") for name in AGENTS), ("ppo", 8.0, "appendix")]
 )
 def test_uard_leaves_the_traps_and_reaches_the_goal(name, trap, panel):
-    last = on_grid(AGENTS[name], "uard", range(5), trap, panel)
+    last = on_grid(AGENTS[name], "uard-0.1", range(5), trap, panel)
     assert (last[:, VISITS] <= 0.5).all()
     assert (last[:, GOAL] >= 0.95).all()

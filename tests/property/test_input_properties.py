@@ -56,7 +56,7 @@ anything = st.recursive(
     max_leaves=6,
 )
 numbers = st.floats(-1e100, 1e100)
-MITIGATIONS = ["uard", "lcb", "mean-of-annotations", "worst-of-annotations", "uard-operator", "raw"]
+MITIGATIONS = ["uard-0.1", "lcb", "mean-of-annotations", "worst-of-annotations", "uard-operator", "raw"]
 
 
 def finite(out: Filtered) -> None:

@@ -39,7 +39,7 @@ from uard.training.feedback.transition_model import TransitionModel
 GOLDEN = "948d549bc5d29ff78cc507a969ccdd5c"
 FULL = Cell(
     TrapGrid(),
-    named("uard"),
+    named("uard-0.1"),
     QLearning(bootstrap=0.5, abstention=Abstention()),
     Panel((Rater(), Rater()), -1.0, 10.0),
 )
@@ -194,7 +194,7 @@ def test_the_key_depends_on_the_classes():
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        (FULL, Cell(TrapGrid(), named("uard"), FULL.agent, Panel((Rater(scale=1), Rater(bias=-0.0)), -1, 10))),
+        (FULL, Cell(TrapGrid(), named("uard-0.1"), FULL.agent, Panel((Rater(scale=1), Rater(bias=-0.0)), -1, 10))),
         (
             FULL.with_(panel=Panel((Rater(contested_noise=1),))),
             FULL.with_(panel=Panel((Rater(contested_noise=np.float64(1.0)),))),
@@ -202,12 +202,12 @@ def test_the_key_depends_on_the_classes():
         (Cell(TrapGrid(6)), Cell(TrapGrid(traps=((3, 3),), goal=(5, 5), horizon=40))),
         (Cell(agent=QLearning(epsilon=1)), Cell(agent=QLearning(epsilon=1.0))),
         (Cell(agent=QLearning(heads=1, bootstrap=0.5)), Cell(agent=QLearning(heads=1))),
-        (Cell(mitigation=named("uard", lam=2, kappa=0)), Cell(mitigation=named("uard", lam=2.0, kappa=-0.0))),
+        (Cell(mitigation=named("uard-0.1", lam=2, kappa=0)), Cell(mitigation=named("uard-0.1", lam=2.0, kappa=-0.0))),
         (Cell(TrapGrid(size=np.int64(6), step_reward=np.float64(-0.1))), Cell()),
         (Cell(episodes=np.int32(500)), Cell()),
         (
-            Cell(mitigation=named("uard"), noise=1, rated=np.float32(0.5)),
-            Cell(mitigation=named("uard"), noise=1.0, rated=0.5),
+            Cell(mitigation=named("uard-0.1"), noise=1, rated=np.float32(0.5)),
+            Cell(mitigation=named("uard-0.1"), noise=1.0, rated=0.5),
         ),
         (
             Cell(mitigation=Typed(np.True_, np.int64(1), 1, np.str_("x"))),

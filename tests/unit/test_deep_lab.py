@@ -37,7 +37,7 @@ GRID = TrapGrid(size=4, traps=((1, 2),), horizon=12)
 
 
 def small(**changes):
-    return Cell(GRID, named("uard"), SMALL, episodes=20, rating_model=RatingModel(2, 8, fits=2, batch=16)).with_(
+    return Cell(GRID, named("uard-0.1"), SMALL, episodes=20, rating_model=RatingModel(2, 8, fits=2, batch=16)).with_(
         **changes
     )
 
@@ -222,6 +222,9 @@ def test_bad_learned_rewards_are_refused(field, value):
 
 
 def test_grids_with_a_doubtful_reward_are_batched_apart():
-    cells = [Cell(TrapGrid(size=10), named("uard"), episodes=2), Cell(LearnedRewardGrid(), named("uard"), episodes=2)]
+    cells = [
+        Cell(TrapGrid(size=10), named("uard-0.1"), episodes=2),
+        Cell(LearnedRewardGrid(), named("uard-0.1"), episodes=2),
+    ]
     store = Store(":memory:")
     assert runner.run([(c, s) for c in cells for s in range(2)], store, workers=1) == 4

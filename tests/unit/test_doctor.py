@@ -349,6 +349,6 @@ def test_rules_that_ask_who_said_what_are_diagnosed_too():
     ratings = true[:, None] + 0.1 * random.normal(size=(90, 3))
     reward = np.where(true == 4.0, 8.0, true)
     log = RatingLog(reward, ratings)
-    found = doctor(log, "pooled")
+    found = doctor(log, "uard")
     assert "lie-still-pays" not in [f.code for f in found.findings]
-    assert filtered(log, "pooled")[-1] < 5.0  # as the doctor shows it, with the premium
+    assert filtered(log, "uard")[-1] < 5.0  # as the doctor shows it, with the premium

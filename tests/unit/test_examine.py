@@ -72,7 +72,7 @@ def test_edac_takes_its_pessimism_off_and_sunrise_weighs():
 
 
 def test_what_a_random_action_would_do_leaves_no_trace_in_the_walk(monkeypatch):
-    loop, state = trained(ON, named("uard"))
+    loop, state = trained(ON, named("uard-0.1"))
     found = examine.examine(loop, state)
     monkeypatch.setattr(examine, "EVERY", 250)
     np.testing.assert_array_equal(found["trace"], examine.examine(loop, state)["trace"])
@@ -115,8 +115,8 @@ def test_the_warning_knows_wrong_values_and_states_that_were_never_visited():
 def test_the_study_is_published_and_shown():
     store = Store(":memory:")
     agents = {
-        "uard": (ON, named("uard")),
-        "uard (ppo)": (ON, named("uard")),
+        "uard-0.1": (ON, named("uard-0.1")),
+        "uard (ppo)": (ON, named("uard-0.1")),
         "edac": (edac(3, **OFF), Raw()),
         "sunrise": (sunrise(3, **OFF), Raw()),
     }

@@ -15,8 +15,8 @@ COMPILE = 3.0
 
 def jobs():
     """Short and long cells, several programs, two kinds of agents."""
-    short = [Cell(TrapGrid(6), named(m), episodes=100 + n) for m in ("raw", "uard") for n in range(10)]
-    long = [Cell(TrapGrid(10), named(m), episodes=1000 + n) for m in ("raw", "uard") for n in range(4)]
+    short = [Cell(TrapGrid(6), named(m), episodes=100 + n) for m in ("raw", "uard-0.1") for n in range(10)]
+    long = [Cell(TrapGrid(10), named(m), episodes=1000 + n) for m in ("raw", "uard-0.1") for n in range(4)]
     deep = [Cell(TrapGrid(6), named("raw"), DeepQ(), episodes=n) for n in (10, 20, 30)]
     return [(cell, seed) for cell in (*short, *long, *deep) for seed in range(2)]
 

@@ -41,7 +41,7 @@ WHERE = Locomotion("hopper", region=Vibration(shaking=0.5, speed=5.0))
 
 
 def cell(**changes):
-    return Cell(**({"environment": WHERE, "mitigation": named("uard"), "agent": TINY, "steps": 512} | changes))
+    return Cell(**({"environment": WHERE, "mitigation": named("uard-0.1"), "agent": TINY, "steps": 512} | changes))
 
 
 def test_a_cell_knows_what_matters_of_it():
@@ -175,31 +175,31 @@ def test_every_study_is_shown_by_a_table_with_a_line_for_each_row():
 def test_shares_of_all_settings_together_by_hand():
     (study,) = (s for s in locomotion.studies(locomotion.STANDARD) if s.name == shown.HACKING)
     rows = list(study.where(robot="hopper", agent="ppo"))
-    hacks = {"raw": [100.0, 300.0], "true reward": [0.0, 0.0], "uard": [1.0, 3.0], "uard-paper": [50.0, 0.0]}
-    true = {"raw": [-5.0, -5.0], "true reward": [400.0, 200.0], "uard": [300.0, 250.0], "uard-paper": [40.0, 40.0]}
+    hacks = {"raw": [100.0, 300.0], "true reward": [0.0, 0.0], "uard-0.1": [1.0, 3.0], "uard-paper": [50.0, 0.0]}
+    true = {"raw": [-5.0, -5.0], "true reward": [400.0, 200.0], "uard-0.1": [300.0, 250.0], "uard-paper": [40.0, 40.0]}
     cells = {
         r.cell.key: {"seeds": [0, 1], "metrics": {"hacks": hacks[m], "true_return": true[m]}}
         for r in rows
         for m in [r["mitigation"]]
     }
     p = Published(every(), [{"format": FORMAT, "cells": cells}])
-    found = shown.pooled(p, "hopper", "ppo", "uard")
+    found = shown.pooled(p, "hopper", "ppo", "uard-0.1")
     assert found is not None
     removed, kept = found
     np.testing.assert_allclose(removed, [0.99, 0.99])
     np.testing.assert_allclose(kept, [0.75, 1.25])
     del cells[rows[-1].cell.key]
-    assert shown.pooled(Published(every(), [{"format": FORMAT, "cells": cells}]), "hopper", "ppo", "uard") is None
-    assert shown.pooled(p, "walker2d", "ppo", "uard") is None
+    assert shown.pooled(Published(every(), [{"format": FORMAT, "cells": cells}]), "hopper", "ppo", "uard-0.1") is None
+    assert shown.pooled(p, "walker2d", "ppo", "uard-0.1") is None
 
 
 def test_other_agents_are_summed_up_by_their_worse_robot():
     (study,) = (s for s in locomotion.studies(locomotion.STANDARD) if s.name == shown.HACKING)
-    hacks = {"raw": 100.0, "true reward": 0.0, "uard": 1.0, "uard-paper": 50.0}
-    true = {"raw": -5.0, "true reward": 400.0, "uard": 300.0, "uard-paper": 40.0}
+    hacks = {"raw": 100.0, "true reward": 0.0, "uard-0.1": 1.0, "uard-paper": 50.0}
+    true = {"raw": -5.0, "true reward": 400.0, "uard-0.1": 300.0, "uard-paper": 40.0}
     cells = {}
     for r in study.where(agent="trpo"):
-        worse = 2.0 if r["robot"] == "walker2d" and r["mitigation"] == "uard" else 1.0
+        worse = 2.0 if r["robot"] == "walker2d" and r["mitigation"] == "uard-0.1" else 1.0
         metrics = {"hacks": [worse * hacks[r["mitigation"]]], "true_return": [true[r["mitigation"]] / worse]}
         cells[r.cell.key] = {"seeds": [0], "metrics": metrics}
     said = shown._others(Published(every(), [{"format": FORMAT, "cells": cells}]))

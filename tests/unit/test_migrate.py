@@ -61,8 +61,8 @@ ON = {"envs": 4, "rollout": 32, "epochs": 1, "minibatches": 2, "count_bonus": 0.
 SOFT = {"network": Network(16, 1e-3, 1.0), "batch": 32, "warmup": 128}
 TANH = Network(16, 1e-3, 100.0, "tanh")
 SHORT, LONG = {"episodes": 20}, {"episodes": 40}
-MODEL = {"rating_model": RatingModel(2, 8, fits=2, batch=16)} | SHORT
-TRANSITIONS = {"rating_model": TransitionModel(2, 8, fits=4, batch=32, capacity=256)}
+MODEL = {"rating_model": RatingModel(2, 8, fits=2, batch=16, predicts="ratings")} | SHORT
+TRANSITIONS = {"rating_model": TransitionModel(2, 8, fits=4, batch=32, capacity=256, predicts="ratings")}
 APPENDIX, COLLUDING, SINGLE = (PANELS[name] for name in ("appendix", "colluding", "single"))
 LEARNED = LearnedRewardGrid(size=6, unrated=2, horizon=20)
 HOPPERS = {
@@ -73,17 +73,17 @@ HOPPERS = {
 }
 CELLS = (
     Cell(GRID, named("raw"), QLearning(), **LONG),
-    Cell(GRID, named("uard"), QLearning(), APPENDIX, 1.2, 0.1, **LONG),
-    Cell(replace(GRID, legitimate=True), named("uard"), QLearning(), COLLUDING, **LONG),
+    Cell(GRID, named("uard-0.1"), QLearning(), APPENDIX, 1.2, 0.1, **LONG),
+    Cell(replace(GRID, legitimate=True), named("uard-0.1"), QLearning(), COLLUDING, **LONG),
     Cell(GRID, named("uard-consistent"), QLearning(heads=2), **LONG),
     Cell(GRID, named("uard-paper"), QLearning(abstention=Abstention(response="ask")), rated=0.1, **LONG),
     Cell(GRID, named("lcb"), QLearning(), SINGLE, **LONG),
     Cell(GRID, named("worst-of-annotations"), QLearning(bootstrap=0.5), ddof=1, **LONG),
     Cell(GRID, named("screening"), QLearning(), snapshots=2, **LONG),
-    Cell(LEARNED, named("uard"), QLearning(), **LONG),
+    Cell(LEARNED, named("uard-0.1"), QLearning(), **LONG),
     Cell(BoatRace(horizon=20), named("mean-of-annotations"), QLearning(), **LONG),
     Cell(AbsentSupervisor(horizon=20), named("uard-operator"), QLearning(), **LONG),
-    Cell(GRID, named("uard"), DeepQ(NET, target_every=16, **REPLAY), **MODEL),
+    Cell(GRID, named("uard-0.1"), DeepQ(NET, target_every=16, **REPLAY), **MODEL),
     Cell(
         GRID,
         named("uard-consistent"),
@@ -92,12 +92,12 @@ CELLS = (
         **SHORT,
     ),
     Cell(GRID, named("raw"), SoftActorCritic(NET, **REPLAY), **SHORT),
-    Cell(TomatoWatering(factor=0.1, horizon=20), named("uard"), DeepQ(NET, conservative=1.0, **REPLAY), **MODEL),
+    Cell(TomatoWatering(factor=0.1, horizon=20), named("uard-0.1"), DeepQ(NET, conservative=1.0, **REPLAY), **MODEL),
     Cell(CartPole(horizon=50), named("raw"), PPO(NET, HEADS, **ROLL), **SHORT),
-    Cell(GRID, named("uard"), PPO(NET, HEADS, **ROLL), APPENDIX, **MODEL),
+    Cell(GRID, named("uard-0.1"), PPO(NET, HEADS, **ROLL), APPENDIX, **MODEL),
     Cell(GRID, named("screening"), TRPO(NET, HEADS, **ROLL), **MODEL),
     Cell(GRID, named("uard-paper"), CPO(NET, HEADS, **ROLL), **SHORT),
-    Cell(HOPPERS["lies"], named("uard"), PPO(TANH, HEADS, **ON), rated=0.3, steps=512, **TRANSITIONS),
+    Cell(HOPPERS["lies"], named("uard-0.1"), PPO(TANH, HEADS, **ON), rated=0.3, steps=512, **TRANSITIONS),
     Cell(HOPPERS["leans"], named("raw"), TRPO(TANH, HEADS, **ON), steps=512),
     Cell(
         HOPPERS["walker"],

@@ -90,14 +90,14 @@ def test_recommended_form_by_hand():
     lam = 0.2 * (1 + 20.0 * (z - 1))
     w = (3 + 0.1) / 4 / (1 + lam * 0.5 * (0.4 + WITH_PROXY) / 2)
     anchor = (3 * -1.0 - 0.5) / 4
-    signal = named("uard", kappa=20.0, unrated_weight=0.1, prior_count=1.0).signal(evidence(), STATISTICS)
+    signal = named("uard-0.1", kappa=20.0, unrated_weight=0.1, prior_count=1.0).signal(evidence(), STATISTICS)
     assert float(signal.reward[0]) == pytest.approx(anchor + w * (4 - anchor), abs=1e-12)
     assert float(signal.reward[0]) == pytest.approx(-0.5112, abs=1e-4)
 
 
 def test_recommended_form_believes_a_bonus_that_all_raters_confirm():
     feedback = Feedback(*(np.array([x]) for x in (100.0, 4.0, 4.0, 0.0, 4.0, 3.0)))
-    signal = named("uard").signal(Evidence(np.array([4.0]), np.array([0.0]), feedback), STATISTICS)
+    signal = named("uard-0.1").signal(Evidence(np.array([4.0]), np.array([0.0]), feedback), STATISTICS)
     assert float(signal.reward[0]) == pytest.approx(4.0, abs=0.05)
 
 
@@ -151,7 +151,7 @@ def test_panel_statistics_are_over_what_was_rated():
 
 @pytest.mark.parametrize(
     ("mitigation", "proxy_is_rater"),
-    [(named("uard"), True), (named("uard-paper"), False), (Screening(), True), (RatedReward(), False)],
+    [(named("uard-0.1"), True), (named("uard-paper"), False), (Screening(), True), (RatedReward(), False)],
 )
 def test_panel_statistics_count_the_proxy_as_the_mitigation_does(mitigation, proxy_is_rater):
     seen = TABLE.count > 0
@@ -229,7 +229,7 @@ def test_named_mitigations_keep_the_contract(name):
 
 
 def test_named_takes_changes():
-    assert named("uard", lam=1.0, kappa=3.0) == RewardDiscounting(ReliabilityFilter(lam=1.0), kappa=3.0)
+    assert named("uard-0.1", lam=1.0, kappa=3.0) == RewardDiscounting(ReliabilityFilter(lam=1.0), kappa=3.0)
     assert named("worst-of-annotations", unrated_weight=0.5) == RatedReward("lowest", unrated_weight=0.5)
     assert named("uard-wiener").filter == ReliabilityFilter(form="wiener")
 
@@ -266,15 +266,15 @@ def test_a_mitigation_without_weights_explains_what_it_learns():
 
 
 def test_what_a_filter_explains_is_what_it_learns():
-    for name in ("uard", "uard-operator"):
+    for name in ("uard-0.1", "uard-operator"):
         why = named(name).explain(evidence(), STATISTICS)
         assert why.signal.reward == pytest.approx(why.anchor + why.weight * (4.0 - why.anchor))
         assert named(name).signal(evidence(), STATISTICS).reward == why.signal.reward
 
 
 def test_without_prior_few_ratings_count_as_all_that_will_ever_be_known():
-    alone = named("uard").without_prior()
-    assert alone == named("uard", prior_count=0.0)
+    alone = named("uard-0.1").without_prior()
+    assert alone == named("uard-0.1", prior_count=0.0)
     once, often = (alone.explain(evidence(count=n), STATISTICS) for n in (1.0, 1000.0))
     assert (once.weight, once.anchor) == (often.weight, often.anchor)
     assert RatedReward().without_prior() == RatedReward()
@@ -293,9 +293,9 @@ def test_without_prior_few_ratings_count_as_all_that_will_ever_be_known():
         (lambda: RewardDiscounting(kappa=math.nan), "^kappa = nan: must be a finite number >= 0$"),
         (lambda: RewardDiscounting(unrated_weight=-0.1), r"^unrated_weight = -0\.1: .* in \[0, 1\]$"),
         (lambda: RewardDiscounting(prior_count=-1), "^prior_count = -1: must be a finite number >= 0$"),
-        (lambda: named("uard", lam=-1), "^lam = -1: must be a finite number >= 0$"),
+        (lambda: named("uard-0.1", lam=-1), "^lam = -1: must be a finite number >= 0$"),
         (lambda: named("uard-paper", alpha=1.1), r"^alpha = 1\.1: must be a finite number in \[0, 1\]$"),
-        (lambda: named("uard", sigma_m=0.0), "sigma_m"),
+        (lambda: named("uard-0.1", sigma_m=0.0), "sigma_m"),
     ],
 )
 def test_bad_parameters_are_refused(make, message):
@@ -304,7 +304,8 @@ def test_bad_parameters_are_refused(make, message):
 
 
 @pytest.mark.parametrize(
-    ("name", "nearest"), [("uard_paper", "uard-paper"), ("UARD", "uard"), ("lbc", "lcb"), ("mean-of-anotations", None)]
+    ("name", "nearest"),
+    [("uard_paper", "uard-paper"), ("UARD", "uard"), ("lbc", "lcb"), ("mean-of-anotations", None)],
 )
 def test_an_unknown_name_suggests_the_nearest(name, nearest):
     nearest = nearest or "mean-of-annotations"
@@ -314,7 +315,7 @@ def test_an_unknown_name_suggests_the_nearest(name, nearest):
 
 def test_negative_uncertainty_is_refused():
     with pytest.raises(InvalidValueError, match=r"^sigma_m\[0\] = -0\.2: must be finite and >= 0$"):
-        named("uard").signal(evidence(sigma_m=-0.4), STATISTICS)
+        named("uard-0.1").signal(evidence(sigma_m=-0.4), STATISTICS)
 
 
 def test_docstring_examples_run():
@@ -350,7 +351,10 @@ def test_a_class_says_what_is_wrong_with_it_when_it_is_defined():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: named("uard", kapa=1.0), r"^parameters of 'uard' = \{'kapa': 1.0\}: must be its fields .*'kapa'"),
+        (
+            lambda: named("uard-0.1", kapa=1.0),
+            r"^parameters of 'uard-0.1' = \{'kapa': 1.0\}: must be its fields .*'kapa'",
+        ),
         (lambda: named("raw", k=1.0), "^parameters of 'raw'"),
         (lambda: named(3), "^mitigation = 3: must be a name"),
         (lambda: RewardDiscounting(filter=0.2), "^filter = 0.2: must be of the class ReliabilityFilter"),

@@ -52,9 +52,9 @@ def test_a_setting_needs_a_name_and_a_value(pair):
         (QLearning(), {"heads": 3, "gamma": 0.9}, QLearning(heads=3, gamma=0.9)),
         (QLearning(abstention=Abstention()), {"abstention.limit": 2}, QLearning(abstention=Abstention(limit=2.0))),
         (
-            named("uard"),
+            named("uard-0.1"),
             {"filter.lam": 3, "filter.form": "exponential", "kappa": 0},
-            RewardDiscounting(filter=replace(named("uard").filter, lam=3.0, form="exponential"), kappa=0.0),
+            RewardDiscounting(filter=replace(named("uard-0.1").filter, lam=3.0, form="exponential"), kappa=0.0),
         ),
         (TrapGrid(), {"traps": [[1, 2]], "start": [0, 1]}, TrapGrid(traps=((1, 2),), start=(0, 1))),
         (TrapGrid(), {"legitimate": True}, TrapGrid(legitimate=True)),
@@ -75,12 +75,16 @@ def test_whole_numbers_become_floats_where_floats_belong(value):
     ("base", "changes", "message"),
     [
         (TrapGrid(), {"sise": 12}, r"^environment setting = 'sise': must be one of .* \(did you mean 'size'\?\)"),
-        (named("uard"), {"filter.lamb": 1}, r"^environment\.filter setting = 'lamb': .*did you mean 'lam'"),
-        (named("uard"), {"filter": 1}, r"^environment setting = 'filter': must be one of filter\.lam, "),
-        (named("uard"), {"kappa.x": 1}, r"^environment setting = 'kappa\.x': must be kappa"),
+        (named("uard-0.1"), {"filter.lamb": 1}, r"^environment\.filter setting = 'lamb': .*did you mean 'lam'"),
+        (named("uard-0.1"), {"filter": 1}, r"^environment setting = 'filter': must be one of filter\.lam, "),
+        (named("uard-0.1"), {"kappa.x": 1}, r"^environment setting = 'kappa\.x': must be kappa"),
         (QLearning(), {"abstention.rule": "ratio"}, r"^environment setting = 'abstention\.rule': must be abstention"),
-        (named("uard"), {"standardise": "False"}, r"^environment setting standardise = 'False': must be true or false"),
-        (named("uard"), {"standardise": 1}, r"^environment setting standardise = 1: must be true or false"),
+        (
+            named("uard-0.1"),
+            {"standardise": "False"},
+            r"^environment setting standardise = 'False': must be true or false",
+        ),
+        (named("uard-0.1"), {"standardise": 1}, r"^environment setting standardise = 1: must be true or false"),
         (QLearning(), {"heads": 2.0}, r"^heads = 2\.0: must be a whole number"),
         (QLearning(), {"epsilon": True}, "^epsilon = True"),
         (TrapGrid(), {"size": [6]}, r"^size = \(6,\)"),
@@ -139,8 +143,8 @@ def test_every_mitigation_comes_as_named(name):
 @pytest.mark.parametrize(
     ("name", "changes", "expected"),
     [
-        ("uard", {"lam": 2, "kappa": 1}, named("uard", lam=2.0, kappa=1.0)),
-        ("uard", {"filter.lam": 2}, named("uard", lam=2.0)),
+        ("uard-0.1", {"lam": 2, "kappa": 1}, named("uard-0.1", lam=2.0, kappa=1.0)),
+        ("uard-0.1", {"filter.lam": 2}, named("uard-0.1", lam=2.0)),
         (
             "uard-paper",
             {"alpha": 0, "beta": 1, "form": "wiener"},
@@ -157,13 +161,13 @@ def test_mitigations_take_the_filters_settings_as_their_own(name, changes, expec
     ("name", "changes", "message"),
     [
         ("urad", {}, r"^mitigation = 'urad': .*did you mean 'uard'"),
-        ("uard", {"lamda": 1}, r"^mitigation setting = 'lamda': must be one of .*did you mean 'lam'"),
+        ("uard-0.1", {"lamda": 1}, r"^mitigation setting = 'lamda': must be one of .*did you mean 'lam'"),
         ("raw", {"lam": 1}, r"^mitigation setting = 'lam'"),
         ("lcb", {"lam": 1}, r"^mitigation setting = 'lam': must be one of k, statistic, unrated_weight"),
-        ("uard", {"lam": -1}, r"^lam = -1\.0: must be a finite number >= 0"),
-        ("uard", {"alpha": 2}, r"^alpha = 2\.0: must be a finite number in \[0, 1\]"),
-        ("uard", {"form": "expnential"}, r"^form = 'expnential': .*did you mean 'exponential'"),
-        ("uard", {"anchor": 5}, r"^anchor = 5: must be one of lowest, zero"),
+        ("uard-0.1", {"lam": -1}, r"^lam = -1\.0: must be a finite number >= 0"),
+        ("uard-0.1", {"alpha": 2}, r"^alpha = 2\.0: must be a finite number in \[0, 1\]"),
+        ("uard-0.1", {"form": "expnential"}, r"^form = 'expnential': .*did you mean 'exponential'"),
+        ("uard-0.1", {"anchor": 5}, r"^anchor = 5: must be one of lowest, zero"),
     ],
 )
 def test_mitigations_refuse(name, changes, message):

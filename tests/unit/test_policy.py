@@ -473,7 +473,7 @@ def test_only_an_oracle_is_shown_hacks():
     assert not TRPO().needs_cost
 
 
-@pytest.mark.parametrize("name", ["uard", "screening", "uard-paper"])
+@pytest.mark.parametrize("name", ["uard-0.1", "screening", "uard-paper"])
 def test_the_mitigation_filters_the_whole_rollout(name):
     out = trained(Spy(**SPY, count_bonus=0.0), corridor(50), Program(100, 48), name)
     given = jax.tree.map(np.asarray, out.good.costs)
@@ -514,7 +514,7 @@ SHORT = Program(episodes=40, steps=1024, walk=8)
 
 
 def test_a_seed_gives_one_run_alone_or_side_by_side():
-    runs = [run_of(TINY, corridor(10), "uard", seed) for seed in (3, 4)]
+    runs = [run_of(TINY, corridor(10), "uard-0.1", seed) for seed in (3, 4)]
     first, again, other = (train(run, SHORT) for run in (runs[0], runs[0], runs[1]))
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -531,14 +531,14 @@ def test_a_seed_gives_one_run_alone_or_side_by_side():
 def test_a_reward_beyond_all_measure_is_caught():
     world = corridor(10)
     world = replace(world, task=world.task._replace(reward=world.task.reward * np.float32(1e38)))
-    out = trained(TINY, world, SHORT, "uard")
+    out = trained(TINY, world, SHORT, "uard-0.1")
     assert common.QUANTITIES[int(out.fault)] != "nothing"
     assert out.episodes < 40
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(out.good) if np.asarray(x).dtype.kind == "f")
 
 
 def test_values_are_read_for_all_actions():
-    out = trained(TINY, corridor(10), SHORT, "uard")
+    out = trained(TINY, corridor(10), SHORT, "uard-0.1")
     mean, deviation, lowest = (np.asarray(x) for x in out.values)
     assert mean.shape == (4, 2)
     assert (deviation > 0).all()

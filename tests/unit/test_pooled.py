@@ -71,6 +71,14 @@ def test_bias_is_not_moved_by_lies():
     assert bias == pytest.approx([0.5 * 100 / 104])
 
 
+def test_rounding_is_no_scale():
+    """Running means of equal rewards differ in their last bits; a scale of 1e-9 would call every rater exact."""
+    reward = np.full(40, -0.1, np.float32)
+    reward[::2] = np.nextafter(reward[::2], np.float32(0.0))
+    each = ByRater(np.ones((40, 1), np.float32), reward[:, None] + 1.0, np.zeros((40, 1), np.float32))
+    assert rater_statistics.fit(reward, each, np.ones(40, bool)).scale == 1.0
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_the_reference_gives_the_same(seed):
     reward, each = panel_data(seed)
@@ -195,7 +203,7 @@ def test_nobody_heard_is_met_with_caution():
 
 
 def test_it_is_made_by_name_and_checked():
-    assert named("pooled", vetoes=1) == PooledDiscounting(vetoes=1)
+    assert named("uard", vetoes=1) == PooledDiscounting(vetoes=1)
     for field, value in [("lies", 0.0), ("slack", -1.0), ("vetoes", 1.5), ("risk", float("nan"))]:
         with pytest.raises(InvalidValueError, match=field):
             PooledDiscounting(**{field: value})

@@ -55,7 +55,7 @@ def test_the_oracle_is_refused_where_no_trainer_can_tell_it_the_truth():
         Cell(TrapGrid(), named("true-reward"), registry.AGENTS["dqn"])
 
 
-@pytest.mark.parametrize("name", ["pooled", "excess", "median", "min-proxy-mean"])
+@pytest.mark.parametrize("name", ["uard", "excess", "median", "min-proxy-mean"])
 def test_rules_that_ask_who_said_what_need_tables(name):
     model = registry.rating_model("model", registry.AGENTS["dqn"], TrapGrid())
     with pytest.raises(InvalidValueError, match=r"^mitigation = .*which rater said what"):

@@ -33,7 +33,7 @@ def finding(diagnosis, code):
 
 def codes(log):
     """Return what the checks of raters find, without all else that the doctor does."""
-    case = case_of(log, "uard", as_filter("uard"))
+    case = case_of(log, "uard-0.1", as_filter("uard-0.1"))
     return {found.code for check in CHECKS if (found := check(case)) is not None}
 
 
@@ -226,7 +226,7 @@ def test_copies_among_two_thousand_raters_are_found():
     truth = random.normal(size=100)
     ratings = truth[:, None] + random.normal(0.0, 0.5, (100, 2000))
     ratings[:, 1999] = ratings[:, 3]
-    found = copy_checks.idle_raters(case_of(RatingLog(truth, ratings), "uard", as_filter("uard")))
+    found = copy_checks.idle_raters(case_of(RatingLog(truth, ratings), "uard-0.1", as_filter("uard-0.1")))
     assert found is not None
     assert found.numbers == {"rating_2000_repeats_rating_4": 1.0}
 
@@ -316,7 +316,7 @@ def any_log(draw):
     return RatingLog(random.choice(pool, n), ratings, **{name: columns[name] for name in sorted(kept)})
 
 
-@given(any_log(), st.sampled_from(["uard", "uard-operator"]))
+@given(any_log(), st.sampled_from(["uard-0.1", "uard-operator"]))
 @settings(max_examples=100, deadline=None)
 def test_any_numbers_end_in_a_diagnosis_that_json_can_hold(log, mitigation):
     if not (np.abs(log.reward) < 1e100).any():

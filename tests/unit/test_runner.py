@@ -121,7 +121,12 @@ def test_batches_hold_every_job_once_and_one_program_each():
     cells = [
         Cell(paper_grid(size, horizon=t), named(name, **changes), noise=noise)
         for size, t in ((6, 40), (8, 40), (10, 80))
-        for name, changes in (("raw", {}), ("uard", {}), ("uard", {"kappa": 3.0}), ("uard", {"anchor": "zero"}))
+        for name, changes in (
+            ("raw", {}),
+            ("uard-0.1", {}),
+            ("uard-0.1", {"kappa": 3.0}),
+            ("uard-0.1", {"anchor": "zero"}),
+        )
         for noise in (0.0, 1.0)
     ]
     jobs = list(dict.fromkeys((c, seed) for seed in range(5) for c in cells))
@@ -147,9 +152,9 @@ def test_batches_are_no_larger_than_asked(size):
         ({"noise": 1.0}, True),
         ({"panel": PANELS["appendix"]}, True),
         ({"panel": PANELS["single"]}, False),
-        ({"mitigation": named("uard", lam=9.0, kappa=0.0)}, True),
-        ({"mitigation": named("uard", lam=9)}, True),
-        ({"mitigation": named("uard", backup="consistent")}, False),
+        ({"mitigation": named("uard-0.1", lam=9.0, kappa=0.0)}, True),
+        ({"mitigation": named("uard-0.1", lam=9)}, True),
+        ({"mitigation": named("uard-0.1", backup="consistent")}, False),
         ({"environment": TrapGrid(10)}, True),
         ({"environment": TrapGrid(30)}, False),
         ({"agent": QLearning(gamma=0.5)}, True),
@@ -160,7 +165,7 @@ def test_batches_are_no_larger_than_asked(size):
     ],
 )
 def test_numbers_share_a_program_and_shapes_do_not(changes, shared):
-    base = Cell(mitigation=named("uard"))
+    base = Cell(mitigation=named("uard-0.1"))
     assert (shape_of(base.with_(**changes))[0] == shape_of(base)[0]) == shared
 
 

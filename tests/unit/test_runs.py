@@ -20,7 +20,7 @@ def three():
     grid = TrapGrid(size=4, traps=((1, 2),), horizon=8)
     law = grid.rating_law(PANELS["appendix"], 0.3)
     agent = QLearning(heads=2)
-    return [tabular.make_run(grid.task(), law, grid.truth(), agent, named("uard"), seed) for seed in (0, 1, 2)]
+    return [tabular.make_run(grid.task(), law, grid.truth(), agent, named("uard-0.1"), seed) for seed in (0, 1, 2)]
 
 
 def test_the_program_of_a_gpu_gives_what_the_program_of_a_cpu_gives(three):

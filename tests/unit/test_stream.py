@@ -89,8 +89,15 @@ def test_a_single_rater_is_checked_against_the_proxy():
     assert out.reward[0] < -0.5
 
 
-def test_sigma_m_makes_a_reward_less_believed():
+def test_sigma_m_lowers_what_is_learned_where_nobody_has_rated():
     stream = RewardStream()
+    told(stream, [HONEST, TRAP, (1.0, (1.0, 1.0, 1.0))])
+    sure, doubtful = (stream([5.0], None, [s], keys=["new"]).reward[0] for s in (0.0, 5.0))
+    assert doubtful == pytest.approx(sure - 5.0)
+
+
+def test_sigma_m_makes_a_reward_less_believed_by_the_rule_of_0_1():
+    stream = RewardStream(named("uard-0.1"))
     told(stream, [HONEST, TRAP, (1.0, (1.0, 1.0, 1.0))])
     sure, doubtful = (stream.filter([1.0], stream.known(np.array([2])), [s], keyed=True).weight[0] for s in (0.0, 5.0))
     assert doubtful < 0.9 * sure
@@ -322,7 +329,7 @@ KEYS = [0, -3, 2.5, math.inf, "text", b"\x00\xff", None, ("grid", (1, b"a"), Tru
 
 
 def keyed_stream(steps=40, **options):
-    stream, random = RewardStream(named("uard", lam=0.3), **options), np.random.default_rng(0)
+    stream, random = RewardStream(named("uard-0.1", lam=0.3), **options), np.random.default_rng(0)
     for _ in range(steps):
         stream(random.normal(size=8), random.normal(size=(8, 3)), keys=KEYS)
         stream(random.normal(size=3), np.where(random.random((3, 2)) < 0.3, np.nan, 1.0))

@@ -35,7 +35,9 @@ class Reproduce:
     mitigation: Names = ()
     """Let this one, your own perhaps, join every study that compares mitigations. Repeatable."""
     seeds: int = 10
-    """Number of seeds (0, 1, ...)."""
+    """Number of seeds."""
+    first_seed: int = 0
+    """The first of them; the others follow it."""
     report: str | None = None
     """Write the report into this folder; only possible for the whole grid, or of panels alone."""
     extract: str | None = None
@@ -62,6 +64,7 @@ class Reproduce:
         from uard.lab.execution.store import Store
 
         _checks.whole("seeds", self.seeds, low=2, high=100_000)
+        _checks.whole("first_seed", self.first_seed)
         terminal.check_workers(self.workers)
         engine = self._engine()
         unusable = [str(error) for error in broken()]
@@ -72,14 +75,14 @@ class Reproduce:
         if self.published is not None:
             self._show_published(chosen[0], console)
             return
-        store, seeds = Store(self.store), range(self.seeds)
+        store, seeds = Store(self.store), self._seeds
         self._train(chosen, store, console, engine)
         if self.failed:
             return
         if self.extract is not None:
             from uard.lab.views import published
 
-            line = f"uard reproduce {' '.join(self.studies)} --seeds {self.seeds}"
+            line = f"uard reproduce {' '.join(self.studies)} {self._said_of_seeds}"
             terminal.write_json(published.extract(chosen, store, seeds, line), self.extract, "extract", indent=None)
         if len(chosen) == 1 and chosen[0].brief:
             from uard.lab.views.study_results import StudyResults
@@ -121,6 +124,15 @@ class Reproduce:
         written = page.write_page(Path(self.report), [panels.section(study, found, seeds)], seeds)
         terminal.say(console, f"report: {written}")
 
+    @property
+    def _seeds(self) -> range:
+        return range(self.first_seed, self.first_seed + self.seeds)
+
+    @property
+    def _said_of_seeds(self) -> str:
+        """Options that name these seeds."""
+        return f"--seeds {self.seeds}" + (f" --first-seed {self.first_seed}" if self.first_seed else "")
+
     def _engine(self) -> Any:
         if _checks.choose("engine", self.engine, ("local", "ray")) == "ray":
             from uard.lab.execution.cluster import Ray
@@ -153,7 +165,7 @@ class Reproduce:
                 raise InvalidValueError(name, given, "left out with --failed, which runs a part only")
 
     def _train(self, chosen: Sequence[Study], store: Store, console: Console, engine: Any) -> None:
-        jobs = list(dict.fromkeys(job for study in chosen for job in study.jobs(range(self.seeds))))
+        jobs = list(dict.fromkeys(job for study in chosen for job in study.jobs(self._seeds)))
         if self.failed:
             failures = store.failures()
             jobs = [(cell, seed) for cell, seed in jobs if (cell.key, seed) in failures]
@@ -167,7 +179,7 @@ class Reproduce:
             workers=self.workers,
             studies=chosen,
             engine=engine,
-            again=f"only these again: uard reproduce {names}--seeds {self.seeds} --store {self.store} --failed\n"
+            again=f"only these again: uard reproduce {names}{self._said_of_seeds} --store {self.store} --failed\n"
             f"their tracebacks: uard status {names}--store {self.store} --errors",
         )
         before = len(jobs) - trained

@@ -93,10 +93,6 @@ class Cell:
             raise _checks.InvalidValueError("mitigation", self.mitigation, allowed)
         self._settle_budget(trainer)
         self._settle_feedback(trainer)
-        if self.mitigation.needs_rater_identity and self.rating_model is not None:
-            instead = "; rating_model=None (--feedback table) keeps tables" * ("table" in trainer.rating_models)
-            allowed = f"one that does not ask which rater said what, where a model predicts the ratings{instead}"
-            raise _checks.InvalidValueError("mitigation", self.mitigation, allowed)
         if not self.mitigation.reads_feedback:
             for name, value in _UNASKED.items():
                 self._put(name, value)

@@ -85,8 +85,8 @@ def _is_registered(cls: type, package: str) -> bool:
 def plain(value: Any) -> Any:
     """Turn (nested) dataclasses into dictionaries of all their fields, with the name of their class as ``type``.
 
-    Tuples become lists; any other value stays as it is. A field that a class got later says ``omitted_at_default`` in
-    its metadata: while it has its default, older results keep their keys.
+    Tuples become lists; any other value stays as it is. A field that a class got later says ``omitted_at`` in its
+    metadata: with that value, which is what older results were made with, they keep their keys.
 
     Examples:
         >>> from uard.agents.networks import Network
@@ -96,7 +96,7 @@ def plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         cls = type(value)
         held = {f.name: getattr(value, f.name) for f in _fields(cls)}
-        omitted = [f.name for f in _fields(cls) if f.metadata.get("omitted_at_default") and held[f.name] == f.default]
+        omitted = [f.name for f in _fields(cls) if held[f.name] == f.metadata.get("omitted_at", dataclasses.MISSING)]
         return {TYPE: type_name(cls), **{name: plain(v) for name, v in held.items() if name not in omitted}}
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]

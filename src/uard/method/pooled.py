@@ -79,7 +79,7 @@ def errors(
     one = xp.ones_like(n)
     answer = (4.0 * statistics.noise + by_rater.m2) / (4.0 + xp.maximum(n - 1.0, 0.0 * one))
     off = slack * (reward - statistics.typical)
-    return answer / xp.maximum(n, one) + statistics.idiosyncrasy + 2.0 * statistics.floor + (off * off)[..., None]
+    return answer / xp.where(n > 0, n, one) + statistics.idiosyncrasy + 2.0 * statistics.floor + (off * off)[..., None]
 
 
 def pool(

@@ -16,10 +16,12 @@ from uard.method.uncertainty import masked_mean
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
+EQUAL = 1e-5  # of their mean: rewards that deviate by less are all the same
 FLOOR = 0.01  # of the reward's scale: no rater is more exact
 MOST = 4096  # state-actions over which statistics are taken; of more, these are evenly spread
 CHI2_MEDIAN = 0.455  # of one degree of freedom
 ROUNDS = 5  # of Huber's iteration
+SOME = 0.1  # of the state-actions, at which a rater must be near the reward for a bias to be looked for there
 LOUDEST = 2.0  # times the median deviation: who is noisier is not heard, among three raters or more
 
 
@@ -73,7 +75,8 @@ def fit(reward: Float[Array, " n"], by_rater: ByRater, rated: Bool[Array, " n"])
     count, said = xp.where(here, by_rater.count, xp.zeros_like(by_rater.count)), by_rater.mean
     centre = masked_mean(reward, rated)
     deviation = xp.sqrt(masked_mean((reward - centre) ** 2, rated))
-    scale = xp.where(deviation > 0, deviation, xp.ones_like(deviation))
+    # Equal rewards differ by what rounding makes of their running means; that is no scale.
+    scale = xp.where(deviation > EQUAL * abs(centre), deviation, xp.ones_like(deviation))
     floor = (FLOOR * scale) ** 2
     noise = answer_variance(count, by_rater.m2, scale)
     bias = robust_bias(count, said - reward[:, None], noise, scale)
@@ -143,6 +146,9 @@ def robust_bias(
 ) -> Float[Array, " K"]:
     """Return a Huber mean of what each rater says beyond the reward, drawn to 0 by four state-actions' worth.
 
+    Lies put a second mode beside that of the bias, and an agent that is paid for them may have filled the table with
+    them. The mode nearest 0 is taken, by beginning at 0 if the rater is near the reward anywhere much; else the median.
+
     Examples:
         >>> import numpy as np
         >>> robust_bias(np.ones((4, 1)), np.full((4, 1), 0.5), noise=np.array([0.1]), scale=1.0).tolist()
@@ -156,8 +162,11 @@ def robust_bias(
     """
     xp = namespace(gap)
     here, one, zero = count > 0, xp.ones_like(gap), xp.zeros_like(gap)
-    variance = noise / xp.maximum(count, one) + 0.01 * scale * scale
-    bias = masked_median(gap, here, axis=0)
+    variance = noise / xp.where(here, count, one) + 0.01 * scale * scale
+    rated = xp.sum(xp.astype(here, gap.dtype), axis=0)
+    near = xp.sum(xp.astype(here & (abs(gap) <= 6.0 * xp.sqrt(variance)), gap.dtype), axis=0)
+    middle = masked_median(gap, here, axis=0)
+    bias = xp.where(near >= SOME * rated, 0.0 * middle, middle)
     for _ in range(ROUNDS):
         far = abs(gap - bias) / xp.sqrt(variance)
         weight = xp.where(far > 6.0, zero, xp.minimum(one, 2.0 / xp.maximum(far, 1e-9 * one))) / variance
@@ -165,7 +174,6 @@ def robust_bias(
         total = xp.sum(weight, axis=0)
         mean = xp.sum(xp.where(here, weight * gap, zero), axis=0) / xp.where(total > 0, total, xp.ones_like(total))
         bias = xp.where(total > 0, mean, bias)
-    rated = xp.sum(xp.astype(here, gap.dtype), axis=0)
     return bias * rated / (rated + 4.0)
 
 
@@ -196,7 +204,7 @@ def own_variance(
     """
     xp = namespace(said)
     here, one, zero = count > 0, xp.ones_like(said), xp.zeros_like(said)
-    of_mean = xp.where(here, noise / xp.maximum(count, one), zero)
+    of_mean = xp.where(here, noise / xp.where(here, count, one), zero)
     others = xp.sum(xp.astype(here, said.dtype), axis=-1)[:, None] - xp.astype(here, said.dtype)
     of_others = (xp.sum(of_mean, axis=-1)[:, None] - of_mean) / xp.maximum(others, one) ** 2
     known = of_mean + of_others + floor

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 A_PANEL = "a tuple of one Rater or more"
 OUTLIER = 6.0  # times the usual noise
-OMITTED_AT_DEFAULT = {"omitted_at_default": True}  # of a field that came later: see uard.lab.config.plain
 UNIFORMS = 3  # uniform numbers that an answer needs of a rater who lapses, skips steps or counts in stars
 
 
@@ -67,9 +66,9 @@ class Rater:
     lapse: float = 0.0
     coverage: float = 1.0
     stars: int | None = None
-    outliers: float = field(default=0.0, metadata=OMITTED_AT_DEFAULT)
-    veto_above: float | None = field(default=None, metadata=OMITTED_AT_DEFAULT)
-    veto: float = field(default=0.0, metadata=OMITTED_AT_DEFAULT)
+    outliers: float = field(default=0.0, metadata={"omitted_at": 0.0})
+    veto_above: float | None = field(default=None, metadata={"omitted_at": None})
+    veto: float = field(default=0.0, metadata={"omitted_at": 0.0})
 
     def __post_init__(self) -> None:
         """Check the parameters.

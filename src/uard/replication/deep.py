@@ -72,7 +72,7 @@ def _mitigated(p: Published) -> Table:
         s = [full(p.of(r, m)) for m in ("hacks", "success_rate", "true_return")]
         rows.append((r["agent"], f"{r['trap']:+g}", r["panel"], *s))
     return Table(
-        "Every agent with uard, 10x10, T = 100, one setting, ratings through the learned model",
+        "Every agent with uard-0.1, 10x10, T = 100, one setting, ratings through the learned model",
         ("agent", "trap", "panel", "trap visits", "goal rate", "true return"),
         tuple(rows),
         3,
@@ -93,15 +93,15 @@ def _rivals(p: Published) -> Table:
 
 
 def matched(p: Published) -> list[str]:
-    """Say for each agent and panel whether ``uard`` has the highest true return among those that hack no more than it.
+    """Say for each agent and panel whether ``uard-0.1`` has the highest true return among those that hack no more than it.
 
-    A rival counts as matched if its hack rate is not above ``uard``'s (95 % intervals overlap or it is lower).
+    A rival counts as matched if its hack rate is not above ``uard-0.1``'s (95 % intervals overlap or it is lower).
     """
     out = []
     for agent in dict.fromkeys(r["agent"] for r in p.rows("deep-rivals")):
         for panel in ("main", "appendix"):
             group = p.rows("deep-rivals", agent=agent, panel=panel)
-            mine = [r for r in group if r["mitigation"] == "uard"]
+            mine = [r for r in group if r["mitigation"] == "uard-0.1"]
             if not mine:
                 continue
             bound = p.of(mine[0], "hacks").ci95[1]
@@ -127,7 +127,7 @@ def matched(p: Published) -> list[str]:
 
 
 def losses(p: Published) -> list[str]:
-    """Say where ``uard`` fails or is beaten in deep agents, found by rule."""
+    """Say where ``uard-0.1`` fails or is beaten in deep agents, found by rule."""
     missed = [
         f"{r['agent']} {r['trap']:+g} {r['panel']}: visits {_visits(p, r)}, goal {brief(p.of(r, 'success_rate'))}"
         for r in p.rows("deep-uard")
@@ -135,13 +135,13 @@ def losses(p: Published) -> list[str]:
     ]
     out = []
     if p.rows("deep-uard"):
-        text = f"Deep agents on 10x10: of {len(p.rows('deep-uard'))} settings uard misses 0.5 visits or 95 % goals in {len(missed)}"
+        text = f"Deep agents on 10x10: of {len(p.rows('deep-uard'))} settings uard-0.1 misses 0.5 visits or 95 % goals in {len(missed)}"
         out.append(text + (": " + "; ".join(missed) if missed else "") + ".")
     unable = [r for r in p.rows("deep-competence") if p.of(r, "success_rate").mean < 0.95]
     if unable:
         goals = "; ".join(f"{r['agent']} {brief(p.of(r, 'success_rate'))}" for r in unable)
         out.append(
-            f"On the true reward of 10x10 these agents miss 95 % goals in the paper's budget, so what they do there with uard says little: {goals}."
+            f"On the true reward of 10x10 these agents miss 95 % goals in the paper's budget, so what they do there with uard-0.1 says little: {goals}."
         )
     out += matched(p)
     for r in p.rows("deep-feedback", source="table"):
@@ -153,7 +153,8 @@ def losses(p: Published) -> list[str]:
                     f"means: {full(learned)} against {full(table)}. Here it extrapolates what few ratings do not support."
                 )
     settings = [
-        (r, f"{r['agent']}, {r['panel']} panel, very noisy raters") for r in p.rows("deep-rivals", mitigation="uard")
+        (r, f"{r['agent']}, {r['panel']} panel, very noisy raters")
+        for r in p.rows("deep-rivals", mitigation="uard-0.1")
     ]
     settings += [
         (r, f"ensemble-dqn, a {r['source']} of the ratings, {100 * r['rated']:g} % rated")
@@ -162,7 +163,7 @@ def losses(p: Published) -> list[str]:
     for r, where in settings:
         goals = p.per_seed(r, "success_rate")
         if lost := int((goals < 0.5).sum()):
-            out.append(f"uard lost the goal in {lost} of {len(goals)} runs: {where}.")
+            out.append(f"uard-0.1 lost the goal in {lost} of {len(goals)} runs: {where}.")
     return out
 
 
@@ -298,8 +299,10 @@ def drawn(p: Published) -> list[tuple[str, str, str]]:
             "Seed 0. Shaded: the windows in which the observed reward is inflated. Arrivals at the goal are left out."
         )
         made.append(("G14, G15 · confidence-adjusted reward under distortion", note, _adjusted(p)))
-        note = "Left: what each would learn from; right: lambda_t of uard, which rises where the reward contradicts the raters."
-        made.append(("G12 · a hacking region, and lambda_t", note, figures.hacking_region(_trace(p, "uard"), WINDOWS)))
+        note = "Left: what each would learn from; right: lambda_t of uard-0.1, which rises where the reward contradicts the raters."
+        made.append(
+            ("G12 · a hacking region, and lambda_t", note, figures.hacking_region(_trace(p, "uard-0.1"), WINDOWS))
+        )
     return [(title, note, data_uri(figure)) for title, note, figure in made]
 
 
@@ -329,7 +332,7 @@ def _trace(p: Published, agent: str) -> np.ndarray:
 
 def _adjusted(p: Published) -> Figure:
     rivals = {name: (_trace(p, name)[1], COLOURS[name]) for name in ("edac", "sunrise")}
-    figure = figures.adjusted_reward(rivals, _trace(p, "uard")[1], "ensemble-dqn + uard", WINDOWS)
+    figure = figures.adjusted_reward(rivals, _trace(p, "uard-0.1")[1], "ensemble-dqn + uard-0.1", WINDOWS)
     for axis in figure.axes:
         axis.axhline(distortion.THRESHOLD, color="k", ls=":", lw=1)
     return figure

@@ -44,7 +44,7 @@ def filters(results: StudyResults) -> Figure:
     left.set(xlabel="uncertainty U", ylabel="weight w", title="Filters at lambda = 2")
     left.legend()
     forms = list(dict.fromkeys(r["form"] for r in results.studies["filters"].rows))
-    for i, reading in enumerate(("uard-paper", "uard-consistent", "uard")):
+    for i, reading in enumerate(("uard-paper", "uard-consistent", "uard-0.1")):
         s = [results.get("filters", "success_rate", form=f, reading=reading) for f in forms]
         place = np.arange(len(forms)) + (i - 1) * 0.26
         right.bar(place, [x.mean for x in s], 0.24, color=COLOURS[reading], label=reading)
@@ -194,7 +194,7 @@ def adjusted_reward(
     for axis, (rival, (values, colour)) in zip(axes, rivals.items(), strict=True):
         _shade(axis, windows)
         axis.plot(values, color=colour, lw=1, label=rival)
-        axis.plot(ours, color=COLOURS["uard"], lw=1.2, label=label)
+        axis.plot(ours, color=COLOURS["uard-0.1"], lw=1.2, label=label)
         axis.set(ylabel="confidence-adjusted reward")
         _legend_below(axis)
     return figure
@@ -211,10 +211,10 @@ def hacking_region(trace: np.ndarray, windows: Sequence[tuple[int, int]]) -> Fig
         _shade(axis, windows)
     axes[0].plot(observed, color=COLOURS["raw"], lw=1, label="naive (observed)")
     axes[0].plot(caution, color=COLOURS["lcb"], lw=1, label="Caution (mean - sd)")
-    axes[0].plot(adjusted, color=COLOURS["uard"], lw=1.2, label="uard")
+    axes[0].plot(adjusted, color=COLOURS["uard-0.1"], lw=1.2, label="uard-0.1")
     axes[0].set(ylabel="effective reward")
     _legend_below(axes[0])
-    axes[1].plot(lam, color=COLOURS["uard"], lw=1)
+    axes[1].plot(lam, color=COLOURS["uard-0.1"], lw=1)
     axes[1].set(ylabel="lambda_t", yscale="log")
     return figure
 

@@ -27,7 +27,7 @@ REFERENCES = ("raw", "true reward")
 REMOVED, KEPT, COST = 0.936, 0.9, 0.05  # the paper's best reduction (J16); what is asked of a filter beside it
 METRICS = ("hacks", "true_return", "observed_return")
 HEADS = ("steps in the region per episode", "true return", "observed return")  # of METRICS
-COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", "uard": "#2c6fbb"}
+COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", "uard-0.1": "#2c6fbb"}
 
 
 def summary(values: np.ndarray) -> str:
@@ -133,30 +133,30 @@ def pooled(p: Published, robot: str, agent: str, mitigation: str) -> tuple[np.nd
 def headline(p: Published) -> str:
     """Say in a few sentences what PPO does in the tasks that lie, also under noise; the README quotes it."""
     lies = [r for r in p.rows(HACKING, agent="ppo") if r["region"] != "none"]
-    raw, ours = ([p.of(r, "hacks").mean for r in lies if r["mitigation"] == m] for m in ("raw", "uard"))
+    raw, ours = ([p.of(r, "hacks").mean for r in lies if r["mitigation"] == m] for m in ("raw", "uard-0.1"))
     kept = {
         m: " and ".join(
             f"{summary(100 * found[1])} % ({robot})"
             for robot in ("hopper", "walker2d")
             if (found := pooled(p, robot, "ppo", m)) is not None
         )
-        for m in ("uard", "uard-paper")
+        for m in ("uard-0.1", "uard-paper")
     }
-    noisy = p.studies[NOISE].one(agent="ppo", mitigation="uard", noise=0.3)
+    noisy = p.studies[NOISE].one(agent="ppo", mitigation="uard-0.1", noise=0.3)
     hopper = p.rows(HACKING, robot="hopper", agent="ppo")
     (honest,) = (r for r in hopper if (r["region"], r["mitigation"]) == ("vibration", "true reward"))
     plain = {r["mitigation"]: r for r in hopper if r["region"] == "none"}
-    _, by_sac = pooled(p, "hopper", "sac", "uard") or (None, None)
+    _, by_sac = pooled(p, "hopper", "sac", "uard-0.1") or (None, None)
     sac = f" SAC on Hopper keeps {summary(100 * by_sac)} % ({len(by_sac)} seeds)." if by_sac is not None else ""
     return (
         f"PPO on the raw reward spends {min(raw):.0f} to {max(raw):.0f} steps of an episode where the reward lies, with "
-        f"`uard` at most {number(max(ours))}. Over all settings of a robot `uard` keeps {kept['uard']} of the true return of "
+        f"`uard-0.1` at most {number(max(ours))}. Over all settings of a robot `uard-0.1` keeps {kept['uard-0.1']} of the true return of "
         f"the agent trained on the true reward; as printed, {kept['uard-paper']}. "
         f"With noise of 30 % of the bonus on every rating (Hopper, vibration) it spends "
         f"{summary(p.per_seed(noisy, 'hacks'))} steps where the reward lies and has a true return of "
         f"{summary(p.per_seed(noisy, 'true_return'))}; the honest agent has {summary(p.per_seed(honest, 'true_return'))}. "
-        f"Without a lie (Hopper, {len(p.seeds_of(plain['uard']))} seeds) its true return is "
-        f"{summary(p.per_seed(plain['uard'], 'true_return'))}, the raw agent's {summary(p.per_seed(plain['raw'], 'true_return'))}."
+        f"Without a lie (Hopper, {len(p.seeds_of(plain['uard-0.1']))} seeds) its true return is "
+        f"{summary(p.per_seed(plain['uard-0.1'], 'true_return'))}, the raw agent's {summary(p.per_seed(plain['raw'], 'true_return'))}."
         f"{sac}{_others(p)}"
     )
 
@@ -164,7 +164,7 @@ def headline(p: Published) -> str:
 def _others(p: Published) -> str:
     parts, seeds = [], 0
     for agent in dict.fromkeys(agent for _, agent in _settings(p) if agent not in ("ppo", "sac")):
-        found = [pooled(p, robot, agent, "uard") for robot in ("hopper", "walker2d")]
+        found = [pooled(p, robot, agent, "uard-0.1") for robot in ("hopper", "walker2d")]
         whole = [(100 * removed.mean(), 100 * kept.mean()) for removed, kept in filter(None, found)]
         if len(whole) == len(found):
             removed, kept = zip(*whole, strict=True)
@@ -173,7 +173,7 @@ def _others(p: Published) -> str:
     if not parts:
         return ""
     return (
-        f" Other agents ({seeds} seed{'s' * (seeds > 1)}, the worse robot): of the raw agent's hacks `uard` removes, and of "
+        f" Other agents ({seeds} seed{'s' * (seeds > 1)}, the worse robot): of the raw agent's hacks `uard-0.1` removes, and of "
         f"the honest agent's true return it keeps, {'; '.join(parts)}."
     )
 
@@ -185,7 +185,7 @@ def _settings(p: Published) -> list[tuple[str, str]]:
 def _pooled(p: Published) -> Table:
     rows = []
     for robot, agent in _settings(p):
-        for mitigation in ("uard-paper", "uard"):
+        for mitigation in ("uard-paper", "uard-0.1"):
             if (found := pooled(p, robot, agent, mitigation)) is not None:
                 shares = (summary(100 * x) for x in found)
                 rows.append((robot, agent, mitigation, str(len(found[0])), *shares))
@@ -285,7 +285,7 @@ def _ablation(p: Published) -> Table:
         for r in p.rows(ABLATION)
     ]
     return Table(
-        f"Which source does the work (H8): Hopper, uard, {_steps(p, ABLATION)}",
+        f"Which source does the work (H8): Hopper, uard-0.1, {_steps(p, ABLATION)}",
         ("agent", "region", "doubt", "panel", *HEADS),
         tuple(rows),
         4,
@@ -301,7 +301,7 @@ def _rating(p: Published) -> Table:
         cells = (summary(p.per_seed(r, m)) for m in ("hacks", "true_return"))
         rows.append((r["region"], r["panel"], r["query"], *cells, *best))
     return Table(
-        f"Which steps are rated: Hopper, PPO with uard, {_steps(p, RATING)}, 15 % of steps",
+        f"Which steps are rated: Hopper, PPO with uard-0.1, {_steps(p, RATING)}, 15 % of steps",
         (
             "region", "panel", "rated steps", "steps in the region per episode", "true return",
             "deterministic: steps in the region", "true return",
@@ -353,13 +353,13 @@ def _speed() -> Table:
 
 
 def losses(p: Published) -> list[str]:
-    """Say where ``uard`` misses what is asked of it in MuJoCo, found by rule."""
+    """Say where ``uard-0.1`` misses what is asked of it in MuJoCo, found by rule."""
     return _of_hacking(p) + _of_noise(p) + _of_twins(p) + _of_distortion(p)
 
 
 def _of_twins(p: Published) -> list[str]:
     dear = []
-    for r in p.rows(LEGITIMATE, mitigation="uard"):
+    for r in p.rows(LEGITIMATE, mitigation="uard-0.1"):
         kept = _kept(p, r, _found(p, LEGITIMATE, mitigation="raw", region=r["region"]))
         if kept is not None and kept < 1 - COST:
             dear.append(f"{r['region']} {r['panel']} {100 * (1 - kept):.0f} %")
@@ -371,7 +371,7 @@ def _of_twins(p: Published) -> list[str]:
 
 
 def _of_distortion(p: Published) -> list[str]:
-    rows = {r["critics"]: r for r in p.rows(DISTORTION, agent="uard")}
+    rows = {r["critics"]: r for r in p.rows(DISTORTION, agent="uard-0.1")}
     out = []
     if len(rows) == 2:
         shared, full_ones = (list(p.derived(rows[k], "warning").T) for k in ("5, shared trunk", "5, full"))
@@ -389,7 +389,7 @@ def _of_distortion(p: Published) -> list[str]:
 
 
 def _of_hacking(p: Published) -> list[str]:
-    ours = [r for r in p.rows(HACKING, mitigation="uard")]
+    ours = [r for r in p.rows(HACKING, mitigation="uard-0.1")]
     if not ours:
         return []
     out = []
@@ -405,14 +405,14 @@ def _of_hacking(p: Published) -> list[str]:
     together = [
         f"{robot} {agent} {summary(100 * found[1])} %"
         for robot, agent in _settings(p)
-        if (found := pooled(p, robot, agent, "uard")) is not None
+        if (found := pooled(p, robot, agent, "uard-0.1")) is not None
     ]
     out.append(
-        f"MuJoCo, {_steps(p, HACKING)}: of {judged} settings in which the raw agent hacks, uard removes less than "
+        f"MuJoCo, {_steps(p, HACKING)}: of {judged} settings in which the raw agent hacks, uard-0.1 removes less than "
         f"93.6 % of its hacks in {len(leaks)}{_by_agent(leaks)}, and leaves no more of them than training on the true reward "
         f"in {honest_too} of these; of {len(lies)} settings it keeps less than 90 % of the true return of the agent trained "
         f"on the true reward in {len(poor)}{_by_agent(poor)}. With so few seeds these shares are rough: see the "
-        f"intervals. All settings of a robot together, uard keeps: {'; '.join(together) or 'not all were run'}."
+        f"intervals. All settings of a robot together, uard-0.1 keeps: {'; '.join(together) or 'not all were run'}."
     )
     tame = [
         f"{r['robot']} {r['region']} {r['agent']}"
@@ -429,7 +429,7 @@ def _of_hacking(p: Published) -> list[str]:
     dear = [f"{_name(r)} {100 * (1 - x):.0f} %" for r, x in plain if x is not None and x < 1 - COST]
     if plain:
         out.append(
-            f"MuJoCo without a lie: uard costs more than 5 % of the true return in {len(dear)} of {len(plain)} "
+            f"MuJoCo without a lie: uard-0.1 costs more than 5 % of the true return in {len(dear)} of {len(plain)} "
             f"settings{_listed(dear)}."
         )
     parts = [f"{r['learns_from']} {summary(p.per_seed(r, 'true_return'))}" for r in p.rows(CAUTION)]
@@ -448,7 +448,7 @@ def _steps_inside(p: Published, r: Row) -> str:
 
 def _of_noise(p: Published) -> list[str]:
     missed = []
-    for r in p.rows(NOISE, mitigation="uard"):
+    for r in p.rows(NOISE, mitigation="uard-0.1"):
         raw, honest = (
             _found(p, HACKING, robot="hopper", region="vibration", agent=r["agent"], mitigation=m) for m in REFERENCES
         )
@@ -457,20 +457,20 @@ def _of_noise(p: Published) -> list[str]:
             hacks, true = (summary(p.per_seed(r, m)) for m in ("hacks", "true_return"))
             missed.append(f"{r['agent']} at {100 * r['noise']:.0f} %: {hacks} hack steps, true return {true}")
     better = []
-    for r in p.rows(NOISE, mitigation="uard"):
+    for r in p.rows(NOISE, mitigation="uard-0.1"):
         own = p.of(r, "true_return").mean
         rivals = [
-            x for x in p.rows(NOISE, agent=r["agent"], noise=r["noise"]) if x["mitigation"] not in ("uard", "raw")
+            x for x in p.rows(NOISE, agent=r["agent"], noise=r["noise"]) if x["mitigation"] not in ("uard-0.1", "raw")
         ]
         if over := [x for x in rivals if p.of(x, "true_return").mean > own]:
             names = ", ".join(f"{x['mitigation']} {summary(p.per_seed(x, 'true_return'))}" for x in over)
             better.append(
-                f"{r['agent']} at {100 * r['noise']:.0f} %: {names} (uard {summary(p.per_seed(r, 'true_return'))})"
+                f"{r['agent']} at {100 * r['noise']:.0f} %: {names} (uard-0.1 {summary(p.per_seed(r, 'true_return'))})"
             )
     out = []
     if missed:
         out.append(
-            f"MuJoCo, Hopper, vibration, noisy raters ({_steps(p, NOISE)}): uard removes less than 93.6 % of the hacks or "
+            f"MuJoCo, Hopper, vibration, noisy raters ({_steps(p, NOISE)}): uard-0.1 removes less than 93.6 % of the hacks or "
             f"keeps less than 90 % of the honest agent's true return: {'; '.join(missed)}."
         )
     if better:
@@ -504,10 +504,10 @@ def drawn(p: Published) -> list[tuple[str, str, str]]:
     if len(traced) == len(p.studies[DISTORTION].rows):
         note = "The first seed. Shaded: the windows in which the observed reward is inflated."
         rivals = {name: (_traced(p, name)[1], "#c1272d") for name in ("edac", "sunrise")}
-        ours = _traced(p, "uard")
-        figure = figures.adjusted_reward(rivals, ours[1], "ensemble-sac + uard", examine.WINDOWS)
+        ours = _traced(p, "uard-0.1")
+        figure = figures.adjusted_reward(rivals, ours[1], "ensemble-sac + uard-0.1", examine.WINDOWS)
         made.append(("G14, G15 · confidence-adjusted reward under distortion, Hopper", note, figure))
-        note = "Left: what each would learn from; right: lambda_t of uard, which should rise in the windows."
+        note = "Left: what each would learn from; right: lambda_t of uard-0.1, which should rise in the windows."
         made.append(
             ("G12 · a hacking region, and lambda_t, Hopper", note, figures.hacking_region(ours, examine.WINDOWS))
         )
@@ -526,11 +526,11 @@ def _traced(p: Published, agent: str) -> np.ndarray:
 
 def _signs(p: Published) -> Figure:
     figure, axes = axes_of(2, 6.2, 3.8)
-    for agent, style in (("uard", "-"), ("uard (ppo)", "--")):
+    for agent, style in (("uard-0.1", "-"), ("uard-0.1 (ppo)", "--")):
         (r, *_) = p.rows(DISTORTION, agent=agent)
         mean = p.derived(r, "perturbed").reshape(-1, len(examine.EPSILONS), len(examine.PERTURBED)).mean(0)
-        for filtered, colour in ((True, COLOURS["uard"]), (False, "#c1272d")):
-            label = f"{'ensemble-sac' if agent == 'uard' else 'ppo'}, {'filtered' if filtered else 'raw reward'}"
+        for filtered, colour in ((True, COLOURS["uard-0.1"]), (False, "#c1272d")):
+            label = f"{'ensemble-sac' if agent == 'uard-0.1' else 'ppo'}, {'filtered' if filtered else 'raw reward'}"
             for axis, column in zip(axes, (0, 2), strict=True):
                 axis.plot(examine.EPSILONS, mean[:, column + (not filtered)], color=colour, ls=style, label=label)
     axes[0].axhline(0.0, color="k", lw=0.8)
@@ -555,7 +555,7 @@ def film() -> list[tuple[str, str, str]]:
     )
     picture = (resources.files("uard.replication") / "results" / "hopper-frames.webp").read_bytes()
     image = "data:image/webp;base64," + base64.b64encode(picture).decode()
-    return [("H4 · what returns of 42 and 110 look like, a hacker, and uard", note, image)]
+    return [("H4 · what returns of 42 and 110 look like, a hacker, and uard-0.1", note, image)]
 
 
 def _dots(p: Published, robot: str) -> Figure:

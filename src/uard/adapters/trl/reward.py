@@ -159,7 +159,7 @@ class UncertaintyDiscountedReward:
                 running if left out.
             sigma_m: Like a judge, but it gives the disagreement of an ensemble: one number >= 0 per completion in
                 standard deviations of a judge, or a row with the scores of N >= 2 members per completion.
-            mitigation: What discounts; ``uard(prior_count=0)`` if left out: no completion comes twice, so its own
+            mitigation: What discounts; ``uard()`` if left out: no completion comes twice, so its own
                 scores are all that will ever be known of it.
             clip: Ratings are cut off at this many standard deviations, in (0, 1e6].
             timeout: Seconds > 0 that each judge has for a batch, or those of some by name; no limit if left out. What
@@ -184,7 +184,7 @@ class UncertaintyDiscountedReward:
         self._weights = _weights(weights, len(self.judges))
         self._proxy = None if proxy is None else list(self.judges).index(proxy)
         self._clip, self._warned = clip, set[str]()
-        stream = RewardStream(uard(prior_count=0.0) if mitigation is None else mitigation)
+        stream = RewardStream(uard() if mitigation is None else mitigation)
         self._memory = Memory(Tally.of(self.judges), _scales(scales, len(self.judges)), Scale(), stream)
         self._start()
 

@@ -242,7 +242,11 @@ def filtered(scores: np.ndarray, mitigation: Mitigation) -> np.ndarray:
 
 
 def _uard(scores: np.ndarray) -> np.ndarray:
-    return filtered(scores, named("uard", prior_count=0.0))
+    return filtered(scores, named("uard"))
+
+
+def _uard_0_1(scores: np.ndarray) -> np.ndarray:
+    return filtered(scores, named("uard-0.1", prior_count=0.0))
 
 
 def _printed(scores: np.ndarray) -> np.ndarray:
@@ -255,6 +259,7 @@ METHODS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "worst case (WCO)": _worst,
     "mean - variance / 2 (UWO)": _penalised,
     "uard-operator": _printed,
+    "uard-0.1": _uard_0_1,
     "uard": _uard,
 }
 

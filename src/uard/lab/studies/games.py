@@ -5,7 +5,9 @@ from __future__ import annotations
 from uard.agents.tabular import QLearning
 from uard.envs.grids.gaming import AbsentSupervisor, BoatRace, TomatoWatering
 from uard.lab.cell import Cell
-from uard.lab.registry import can_work, deep_agents
+from uard.lab.registry import can_work, deep_agents, trainer
+from uard.lab.studies.common import can_use
+from uard.lab.studies.grids import COMPARED
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import named
 from uard.training.feedback.rating_model import RatingModel
@@ -45,15 +47,8 @@ def gaming() -> tuple[Row, ...]:
         for where, game in GAMES.items()
         for name, agent in agents.items()
         if can_work(agent, game)
-        for mitigation in (
-            "raw",
-            "worst-of-annotations",
-            "lcb",
-            "screening",
-            "mean-of-annotations",
-            "uard-paper",
-            "uard",
-        )
+        for mitigation in COMPARED
+        if can_use(named(mitigation), trainer(agent, game))
     )
 
 

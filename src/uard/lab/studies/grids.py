@@ -15,12 +15,18 @@ from uard.ratings.panels import Panel, Rater, as_panel
 
 COMPARED = (
     "raw",
+    "true-reward",
     "mean-of-annotations",
+    "median",
     "worst-of-annotations",
     "lcb",
+    "min-proxy-mean",
+    "min-proxy-median",
+    "excess",
     "screening",
     "uard-paper",
     "uard-consistent",
+    "uard-0.1",
     "uard",
 )
 NOISES = (0.0, 0.1, 0.2, 0.3, 0.6, 1.2, 3.3)
@@ -73,6 +79,7 @@ def budgets() -> tuple[Row, ...]:
     rivals = {
         "uard": partial(named, "uard"),
         "uard, unrated believed": partial(named, "uard", unrated_weight=1.0),
+        "uard-0.1": partial(named, "uard-0.1"),
         "mean-of-annotations": partial(named, "mean-of-annotations"),
         "worst-of-annotations": partial(named, "worst-of-annotations"),
         "worst-of, unrated in part": partial(named, "worst-of-annotations", unrated_weight=0.1),
@@ -94,7 +101,7 @@ def budgets() -> tuple[Row, ...]:
     )
 
 
-DISSENT = ("raw", "mean-of-annotations", "median", "worst-of-annotations", "lcb", "uard", "pooled")
+DISSENT = ("raw", "mean-of-annotations", "median", "worst-of-annotations", "lcb", "uard-0.1", "uard")
 UNSEEN = (
     TrapGrid(size=5, traps=((2, 2),)),
     TrapGrid(size=7, traps=((0, 2), (2, 0), (3, 3)), trap_reward=2.0),
@@ -120,12 +127,12 @@ def unseen() -> tuple[Row, ...]:
         )
         for grid in UNSEEN
         for panel in PANELS
-        for name in ("raw", "worst-of-annotations", "lcb", "uard-paper", "uard")
+        for name in ("raw", "worst-of-annotations", "lcb", "uard-paper", "uard-0.1", "uard")
     )
 
 
 def settings() -> tuple[Row, ...]:
-    """How much do the parameters of ``uard`` matter? Lambda, kappa and the parts, on the hardest noisy grids."""
+    """How much do the parameters of ``uard-0.1`` matter? Lambda, kappa and the parts, on the hardest noisy grids."""
     variants = {
         "as recommended": {},
         "lam 0.05": {"lam": 0.05},
@@ -149,7 +156,7 @@ def settings() -> tuple[Row, ...]:
     }
     return tuple(
         row(
-            Cell(paper_grid(10, trap), named("uard", **changes), panel=as_panel(panel), noise=noise),
+            Cell(paper_grid(10, trap), named("uard-0.1", **changes), panel=as_panel(panel), noise=noise),
             variant=name,
             trap=trap,
             panel=panel,
@@ -177,9 +184,9 @@ def sources() -> tuple[Row, ...]:
     variants: dict[tuple[str, str], Mitigation] = {("raw", "-"): RAW}
     for way, changes in ways.items():
         for lam in (2.0, 10.0, 50.0, 200.0):
-            variants[f"plain filter, lam {lam:g}", way] = named("uard", lam=lam, **(plain | changes))
-        variants["uard", way] = named("uard", **changes)
-    for rival in ("worst-of-annotations", "lcb"):
+            variants[f"plain filter, lam {lam:g}", way] = named("uard-0.1", lam=lam, **(plain | changes))
+        variants["uard-0.1", way] = named("uard-0.1", **changes)
+    for rival in ("worst-of-annotations", "lcb", "uard"):
         variants[rival, "-"] = named(rival)
     return tuple(
         row(Cell(LearnedRewardGrid(model_seed=model), mitigation), mitigation=name, sources=way, model=model)
@@ -195,7 +202,7 @@ def dissent() -> tuple[Row, ...]:
     the others, and then overrules the expert, too: both ends of that choice are here.
     """
     compared: dict[str, Mitigation] = {name: named(name) for name in DISSENT}
-    compared["pooled (1 veto)"] = named("pooled", vetoes=1)
+    compared["uard, 1 veto"] = named("uard", vetoes=1)
     panels = {
         f"1 of {raters} says {says:g} of the goal": (Rater(),) * (raters - 1) + (Rater(veto_above=5.0, veto=says),)
         for raters in (3, 5)
@@ -226,7 +233,7 @@ def studies() -> tuple[Study, ...]:
         Study("legitimate", "Twins whose bonus is real", "over-caution", legitimate()),
         Study("budgets", "1 %, 10 % and 100 % of steps rated", "honest competition", budgets()),
         Study("unseen", "Grids that nothing was tuned on", "generality", unseen()),
-        Study("settings", "Parameters and parts of uard", "sensitivity", settings()),
+        Study("settings", "Parameters and parts of uard-0.1", "sensitivity", settings()),
         Study(
             "sources", "A learned reward that extrapolates: which source of doubt does the work", "H8, K10", sources()
         ),

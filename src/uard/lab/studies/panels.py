@@ -19,8 +19,7 @@ from uard.lab.study import LazyRows, Row, Study, row
 from uard.method.mitigations import NAMED, Mitigation, named
 from uard.ratings.panels import Panel, random_panel, random_share
 
-OURS, ONE_VETO, BEFORE = "uard", "uard, 1 veto", "uard-0.1"  # as the study's labels have them
-RULE, RULE_BEFORE = "pooled", "uard"  # as the registry of mitigations has them
+OURS, ONE_VETO = "uard", "uard, 1 veto"
 ORACLE, FLOOR = "true-reward", "random walk"  # between which regret is measured
 RIVALS = (
     "raw",
@@ -32,6 +31,7 @@ RIVALS = (
     "min-proxy-median",
     "excess",
     *(name for name in ("witness",) if name in NAMED),
+    "uard-0.1",
     "uard-paper",
 )
 GRIDS, MDPS = "random grids", "random MDPs"
@@ -75,7 +75,7 @@ def scenario(tasks: str, seed: int) -> Scenario:
 def mitigations() -> dict[str, Mitigation]:
     """Return what is compared, and the oracle, by the study's labels."""
     rivals = {name: named(name) for name in (*RIVALS, ORACLE)}
-    return rivals | {OURS: named(RULE), ONE_VETO: named(RULE, vetoes=1), BEFORE: named(RULE_BEFORE)}
+    return rivals | {OURS: named(OURS), ONE_VETO: named(OURS, vetoes=1)}
 
 
 def rows(seeds: Sequence[tuple[str, int]]) -> tuple[Row, ...]:
@@ -102,5 +102,5 @@ def studies(development: bool = False) -> tuple[Study, ...]:
         seeds = [(GRIDS, seed) for seed in range(1, 400, 2)] + [(MDPS, seed) for seed in range(1, 200, 2)]
         name, title, answers = "panels", "Random panels that nothing was tuned on", "generality, held out"
     build: Callable[[], tuple[Row, ...]] = partial(rows, seeds)
-    lazy = LazyRows(build, len(seeds) * (len(RIVALS) + 5))  # ours twice, the one before, oracle and random walk
+    lazy = LazyRows(build, len(seeds) * (len(RIVALS) + 4))  # ours twice, oracle, random walk
     return (Study(name, title, answers, lazy, brief=PUBLISHED, development=development),)

@@ -9,12 +9,13 @@ from typing import Any
 from uard import _checks
 from uard.lab import registry as names
 from uard.lab.cell import Cell
-from uard.lab.studies.common import LOCOMOTION_STEPS, PANELS
+from uard.lab.studies.common import LOCOMOTION_STEPS, PANELS, can_use
 from uard.lab.studies.grids import COMPARED
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import named
 from uard.ratings.panels import as_panel
 
+BESIDE = ("uard", "uard-0.1")  # what a study that compares mitigations holds one of
 AGENTS = ("q-learning", "ensemble-dqn", "ppo")  # the first that can work in an environment learns there
 
 
@@ -70,11 +71,12 @@ def _crossed(where: str, environment: Any, name: str, agent: Any, panels: tuple[
         )
         for panel in panels
         for mitigation in mitigations()
+        if can_use(named(mitigation), trainer)
     ]
 
 
 def compared_with(studies: Iterable[Study], others: Iterable[str]) -> tuple[Study, ...]:
-    """Add mitigations to all studies that compare some: beside each row of ``uard``, one for each of the others.
+    """Add mitigations to all studies that compare some: beside each row of ``BESIDE``, one for each of the others.
 
     Raises:
         InvalidValueError: none of the studies compares mitigations, or a name is no mitigation.
@@ -82,13 +84,14 @@ def compared_with(studies: Iterable[Study], others: Iterable[str]) -> tuple[Stud
     studies, added = tuple(studies), {name: named(name) for name in dict.fromkeys(others)}
     if not added:
         return studies  # whose rows need not be built
-    recommended, grown = named("uard"), []
+    grown, compares = [], False
     for study in studies:
-        places = [r for r in study.where(mitigation="uard") if r.cell.mitigation == recommended]
+        places = [r for name in BESIDE for r in study.where(mitigation=name) if r.cell.mitigation == named(name)]
+        compares |= bool(places)
         new = [_instead(r, name, r.cell.with_(mitigation=m)) for name, m in added.items() for r in places]
-        have = {r.labels for r in study.rows}
-        grown.append(replace(study, rows=(*study.rows, *(r for r in new if r.labels not in have))))
-    if not any(any(s.where(mitigation="uard")) for s in studies):
+        rows = {r.labels: r for r in (*study.rows, *new)} | {r.labels: r for r in study.rows}
+        grown.append(replace(study, rows=tuple(rows.values())))
+    if not compares:
         allowed = f"left out: none of {', '.join(s.name for s in studies)} compares mitigations"
         raise _checks.InvalidValueError("mitigation", ", ".join(added), allowed)
     return tuple(grown)

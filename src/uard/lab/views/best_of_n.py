@@ -18,6 +18,7 @@ COLOURS = {
     "worst case (WCO)": "#17a2b8",
     "mean - variance / 2 (UWO)": "#d6589f",
     "uard-operator": "#2c6fbb",
+    "uard-0.1": "#6abf69",
     "uard": "#1b8a4b",
 }
 

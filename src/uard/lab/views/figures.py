@@ -21,6 +21,7 @@ COLOURS = {
     "multi-head": "#e08214",
     "uard-paper": "#2c6fbb",
     "uard-consistent": "#7b4fa3",
+    "uard-0.1": "#6abf69",
     "uard": "#1b8a4b",
     "random walk": "#777777",
     "mean-of-annotations": "#8c6d31",

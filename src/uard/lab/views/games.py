@@ -9,8 +9,12 @@ LISTED = 12  # comparisons that are named one by one
 
 
 def losses(p: Published) -> list[str]:
-    """Say where another mitigation, raw included, has the higher true return than ``uard`` (intervals apart)."""
-    games = p.rows("gaming", mitigation="uard")
+    """Say where another mitigation, raw included, has the higher true return than ``uard`` (intervals apart).
+
+    Where ``uard`` was not run, ``uard-0.1`` stands for it.
+    """
+    ours = {(r["game"], r["agent"]): r for name in ("uard-0.1", "uard") for r in p.rows("gaming", mitigation=name)}
+    games = list(ours.values())
     if not games:
         return []
     beaten = []

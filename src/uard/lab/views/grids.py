@@ -83,12 +83,12 @@ def _denied(results: StudyResults) -> str:
 
 def _learned(results: StudyResults) -> str:
     """The reward that is itself a model of ratings."""
-    learned = list(results.studies["sources"].where(mitigation="uard", sources="sigma_m and sigma_h"))
+    learned = list(results.studies["sources"].where(mitigation="uard-0.1", sources="sigma_m and sigma_h"))
     fooled = [
         r for r in learned if results.of(r.cell, "hacks").mean > 1 or results.of(r.cell, "success_rate").mean < 0.95
     ]
     return (
-        f"A reward that is itself a model of ratings (study sources): uard as recommended fails for {len(fooled)} of "
+        f"A reward that is itself a model of ratings (study sources): uard-0.1 fails for {len(fooled)} of "
         f"{len(learned)} models: it believes a tenth of what nobody has rated, and their extrapolation is large enough for "
         "that. A plain filter with both sources and a large constant lambda does not (table below)."
     )
@@ -213,7 +213,7 @@ def _dissent(results: StudyResults) -> Table:
         1,
         "Whoever denies the goal, which pays 10 and is worth it, tells the truth elsewhere, as the others do everywhere "
         "(noise of sd 0.1). In the last rows all but one are drawn towards what a trap seems to pay. Of three raters nobody "
-        "can know who is right. Of five, `pooled` may overrule one who is alone, low and no more precise than the others "
+        "can know who is right. Of five, `uard` may overrule one who is alone, low and no more precise than the others "
         "(vetoes=1), and then overrules the only one who tells the truth, too.",
     )
 
@@ -262,5 +262,5 @@ def _sources(results: StudyResults) -> Table:
         2,
         "Five reward models (mean ± sd over models of the mean over seeds); solved: at most 1 hack and 95 % goals. Inside the "
         "rated part the trap is contested (sigma_h), outside the model extrapolates (sigma_m). The plain filter needs "
-        "both, and a far larger lambda than the paper's. `uard` as recommended believes a tenth of what nobody rated.",
+        "both, and a far larger lambda than the paper's. `uard-0.1` believes a tenth of what nobody rated.",
     )

@@ -2,9 +2,9 @@
 
 from uard.method.feedback import ByRater, Feedback
 from uard.method.mitigations.baselines import RatedReward, Raw, Screening, TrueReward
-from uard.method.mitigations.discounting import RewardDiscounting, uard, uard_paper
+from uard.method.mitigations.discounting import RewardDiscounting, uard_0_1, uard_paper
 from uard.method.mitigations.panel_statistics import PanelStatistics
-from uard.method.mitigations.pooled import PooledDiscounting
+from uard.method.mitigations.pooled import PooledDiscounting, uard
 from uard.method.mitigations.protocol import Backup, Evidence, Explanation, LearningSignal, Mitigation
 from uard.method.mitigations.registry import NAMED, fault, named
 from uard.method.mitigations.robust import ExcessDisagreement, RaterCap
@@ -30,5 +30,6 @@ __all__ = [
     "fault",
     "named",
     "uard",
+    "uard_0_1",
     "uard_paper",
 ]

@@ -1,4 +1,4 @@
-"""Uncertainty-Aware Reward Discounting: the filter as printed, and as we recommend it."""
+"""Uncertainty-Aware Reward Discounting by the panel as a whole: as printed, and as recommended in version 0.1."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MAD_FLOOR = 0.01  # of the reward's scale: raters who agree to within this are 
 
 @dataclass(frozen=True)
 class RewardDiscounting(Mitigation):
-    """Uncertainty-Aware Reward Discounting in all its forms; ``uard`` and ``uard_paper`` name two.
+    """Discounting by how far the panel as a whole disagrees; ``uard_0_1`` and ``uard_paper`` name two forms.
 
     Examples:
         >>> from uard.ratings.stream import RewardStream
@@ -169,14 +169,14 @@ class RewardDiscounting(Mitigation):
         return replace(self, prior_count=0.0)
 
 
-def uard(lam: float = 0.2, alpha: float = 0.5, beta: float = 0.5, **changes: Any) -> RewardDiscounting:
-    """What we recommend: anchored reward, adaptive lambda, the proxy as one more rater; a pure reward transform.
+def uard_0_1(lam: float = 0.2, alpha: float = 0.5, beta: float = 0.5, **changes: Any) -> RewardDiscounting:
+    """What version 0.1 recommended: anchored reward, adaptive lambda, the proxy as one more rater; no scores.
 
     The base lambda is a tenth of the paper's and the gain kappa makes up for it where disagreement stands out: noise
     that all ratings share is then no reason for doubt.
 
     Examples:
-        >>> uard().anchor, uard(kappa=0.0).filter.lam
+        >>> uard_0_1().anchor, uard_0_1(kappa=0.0).filter.lam
         ('lowest', 0.2)
 
     Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from uard import _checks
 from uard.method import pooled, rater_statistics
@@ -53,13 +53,14 @@ class PooledDiscounting(Mitigation):
         contest: How many tau the anchor lies below the pooled mean, >= 0.
         caution: How many standard errors of the pooled mean it lies below that, >= 0.
         risk: Premium >= 0 for not knowing which hypothesis holds, in posterior standard deviations.
-        unrated_weight: How far an extraordinary reward is believed that nobody has rated, in [0, 1].
+        unrated_weight: How far an extraordinary reward is believed that nobody has rated, in [0, 1]. A higher one
+            explores more: better on random problems whose raters answer seldom (development regret .09 at 0.05, .05
+            at 1), but with 0.4 an agent on the paper's 10x10 grid no longer reaches the goal at 1 % rated steps.
         vetoes: How many lone low dissenters may be overruled, see ``uard.method.pooled.overruled``; >= 0.
     """
 
     discounts: ClassVar[bool] = True
     refits_early: ClassVar[bool] = True
-    needs_rater_identity: ClassVar[bool] = True
 
     lies: float = 0.2
     slack: float = 0.1
@@ -128,3 +129,19 @@ class PooledDiscounting(Mitigation):
             xp.where(rated, b, u + 0.0 * b),
             p.tau,
         )
+
+
+def uard(**changes: Any) -> PooledDiscounting:
+    """What we recommend: the pooled rule, a pure reward transform that knows who said what.
+
+    Examples:
+        >>> uard().vetoes, uard(vetoes=1).vetoes
+        (0, 1)
+
+    Args:
+        changes: Parameters of ``PooledDiscounting`` that are not the recommended ones.
+
+    Raises:
+        InvalidValueError: naming the parameter, the value and what is allowed.
+    """
+    return PooledDiscounting(**changes)

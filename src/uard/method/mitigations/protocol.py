@@ -99,7 +99,6 @@ class Mitigation(ABC):
         refits_early: Whether the panel's statistics are measured at steps 1, 2, 4 ... of training, too: a rule that
             doubts nobody before it knows them would learn the first lie before it is doubted.
         reads_truth: Whether it is an oracle that learns from the true reward; only where a trainer can give it that.
-        needs_rater_identity: Whether it needs each rater's own ratings; a model of the panel's ratings gives none.
         acts_on: ``reward``: it changes the reward that is learned from; ``score``: how actions are scored; ``both``.
         backup: ``greedy``: the target takes the best value; ``consistent``: the value of the action with the best
             *score*.
@@ -109,7 +108,6 @@ class Mitigation(ABC):
     discounts: ClassVar[bool] = False
     refits_early: ClassVar[bool] = False
     reads_truth: ClassVar[bool] = False
-    needs_rater_identity: ClassVar[bool] = False
     acts_on: ActsOn = "reward"
     backup: Backup = "greedy"
 

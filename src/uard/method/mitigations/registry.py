@@ -8,8 +8,8 @@ from typing import Any
 
 from uard import _checks, plugins
 from uard.method.mitigations.baselines import RatedReward, Raw, Screening, TrueReward
-from uard.method.mitigations.discounting import uard, uard_paper
-from uard.method.mitigations.pooled import PooledDiscounting
+from uard.method.mitigations.discounting import uard_0_1, uard_paper
+from uard.method.mitigations.pooled import uard
 from uard.method.mitigations.protocol import Mitigation
 from uard.method.mitigations.robust import ExcessDisagreement, RaterCap
 
@@ -24,8 +24,8 @@ NAMED: dict[str, Callable[..., Mitigation]] = {
     "excess": ExcessDisagreement,
     "lcb": partial(RatedReward, statistic="bound"),
     "screening": Screening,
-    "pooled": PooledDiscounting,
     "uard": uard,
+    "uard-0.1": uard_0_1,
     "uard-paper": uard_paper,
     "uard-consistent": partial(uard_paper, backup="consistent"),
     "uard-operator": partial(uard_paper, acts_on="reward"),
@@ -45,8 +45,8 @@ def named(name: str, **parameters: Any) -> Mitigation:
     Examples:
         >>> named("worst-of-annotations")
         RatedReward(statistic='lowest', k=1.0, unrated_weight=1.0)
-        >>> named("uard", kappa=0.0).kappa
-        0.0
+        >>> named("uard", vetoes=1).vetoes
+        1
 
     Args:
         name: One of ``NAMED``, or what an installed package calls its own.

@@ -33,8 +33,6 @@ class RaterCap(Mitigation):
         cap: Whether the reward is only capped by it: min(reward, statistic).
     """
 
-    needs_rater_identity: ClassVar[bool] = True
-
     statistic: Literal["mean", "median"] = "median"
     cap: bool = True
 
@@ -79,7 +77,6 @@ class ExcessDisagreement(Mitigation):
     """
 
     refits_early: ClassVar[bool] = True
-    needs_rater_identity: ClassVar[bool] = True
 
     k: float = 1.5
 

@@ -25,9 +25,9 @@ from uard.replication.verdicts import Numbers, Part, each
 
 GRID = "deep-distortion"
 UARDS = {  # on Hopper: agent and critics
-    "SAC, shared trunk": ("uard", "5, shared trunk"),
-    "SAC, full critics": ("uard", "5, full"),
-    "PPO": ("uard (ppo)", "5, shared trunk"),
+    "SAC, shared trunk": ("uard-0.1", "5, shared trunk"),
+    "SAC, full critics": ("uard-0.1", "5, full"),
+    "PPO": ("uard-0.1 (ppo)", "5, shared trunk"),
 }
 RIVALS = {"EDAC": ("edac", "5, full"), "SUNRISE": ("sunrise", "5, shared trunk")}
 
@@ -35,7 +35,7 @@ RIVALS = {"EDAC": ("edac", "5, full"), "SUNRISE": ("sunrise", "5, shared trunk")
 def _on_grid() -> dict[str, Row] | None:
     """Return the rows of the grid's study by agent; None if they are not all published."""
     rows = {r["agent"]: r for r in published.packaged().rows(GRID)}
-    return rows if set(rows) == {"uard", "edac", "sunrise"} else None
+    return rows if set(rows) == {"uard-0.1", "edac", "sunrise"} else None
 
 
 def _on_hopper() -> dict[str, Row] | None:
@@ -62,7 +62,7 @@ def _activations(results: StudyResults) -> dict[str, Any] | None:
     if grid is None or hopper is None:
         return None
     return {
-        "grid_ours": _derived(grid["uard"], "activations"),
+        "grid_ours": _derived(grid["uard-0.1"], "activations"),
         "grid_edac": _derived(grid["edac"], "activations"),
         "hopper_ours": {name: _reaction(hopper[name], "activations") for name in UARDS},
         "hopper_edac": _reaction(hopper["EDAC"], "activations"),
@@ -92,7 +92,7 @@ def _believed(rival: str) -> dict[str, Any] | None:
     if grid is None or hopper is None:
         return None
     return {
-        "grid_ours": _derived(grid["uard"], "largest").mean,
+        "grid_ours": _derived(grid["uard-0.1"], "largest").mean,
         "grid_rival": _derived(grid[rival.lower()], "largest").mean,
         "hopper_ours": {name: examine.BONUS * _reaction(hopper[name], "believed").mean for name in UARDS},
         "hopper_rival": examine.BONUS * _reaction(hopper[rival], "believed").mean,
@@ -154,8 +154,8 @@ J44 = Conditions(
 # --- adaptive against static pessimism ---
 
 STATIC = {  # study and labels of pessimism whose strength is a constant
-    "uard with constant lambda 0.2": ("settings", {"variant": "kappa 0 (not adaptive)"}),
-    "uard with constant lambda 2": ("settings", {"variant": "lam 2, kappa 0"}),
+    "uard-0.1 with constant lambda 0.2": ("settings", {"variant": "kappa 0 (not adaptive)"}),
+    "uard-0.1 with constant lambda 2": ("settings", {"variant": "lam 2, kappa 0"}),
     "UARD as printed": ("matrix", {"mitigation": "uard-paper"}),
     "UARD with a consistent backup": ("matrix", {"mitigation": "uard-consistent"}),
     "screening of contested steps": ("matrix", {"mitigation": "screening"}),
@@ -195,7 +195,7 @@ def _adaptation(results: StudyResults) -> dict[str, Any] | None:
     grid, hopper = _on_grid(), _on_hopper()
     if grid is None or hopper is None:
         return None
-    rows = {"grid": grid["uard"]} | {f"Hopper, {name}": hopper[name] for name in UARDS}
+    rows = {"grid": grid["uard-0.1"]} | {f"Hopper, {name}": hopper[name] for name in UARDS}
     walks, here = {name: _trace(row) for name, row in rows.items()}, examine.inside()
     lowest = _settings(results, *STATIC["the lowest rating"])
     return {
@@ -219,7 +219,7 @@ J39 = Conditions(
             lambda n, where: n["inside"][where] > n["outside"][where],
         ),
         *each(
-            "{}: in the Hacking Region static pessimism (mean less deviation) believes more of the lie than uard",
+            "{}: in the Hacking Region static pessimism (mean less deviation) believes more of the lie than uard-0.1",
             _PLACES,
             lambda n, where: n["caution"][where] > 0,
         ),

@@ -34,7 +34,7 @@ def _hacks(robot: str, mitigation: str) -> list[tuple[float, float]]:
 
 def _everywhere(results: StudyResults) -> dict[str, Any] | None:
     printed_form = {name: _hacks(robot, "uard-paper") for name, robot in ROBOTS.items()}
-    repaired = [1 - ours / raw for robot in ROBOTS.values() for ours, raw in _hacks(robot, "uard")]
+    repaired = [1 - ours / raw for robot in ROBOTS.values() for ours, raw in _hacks(robot, "uard-0.1")]
     if not all(printed_form.values()) or not repaired:
         return None
     ours, base, walker = (
@@ -98,7 +98,7 @@ def _violations(mitigation: str, noise: float) -> dict[str, Summary] | None:
 
 
 def _noisy(results: StudyResults) -> dict[str, Any] | None:
-    clean, noisy, ours = _violations("raw", 0.0), _violations("raw", 0.3), _violations("uard", 0.3)
+    clean, noisy, ours = _violations("raw", 0.0), _violations("raw", 0.3), _violations("uard-0.1", 0.3)
     if clean is None or noisy is None or ours is None:
         return None
     return {
@@ -135,7 +135,7 @@ GRID = {
 
 
 def _degradation(results: StudyResults) -> dict[str, Any] | None:
-    ours = [_violations("uard", percent / 100) for percent in _LEVELS]
+    ours = [_violations("uard-0.1", percent / 100) for percent in _LEVELS]
     clean, noisy = _violations("raw", 0.0), _violations("raw", 0.3)
     if clean is None or noisy is None or None in ours:
         return None

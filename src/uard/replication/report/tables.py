@@ -10,7 +10,7 @@ from uard.replication import paper, theory
 def headline(results: StudyResults) -> list[dict[str, str]]:
     """Return the four agents on 10x10 at the paper's T = 80, both panels: what a reader must see first."""
     rows = []
-    for agent in ("baseline", "random walk", "uard-paper", "uard-consistent", "uard"):
+    for agent in ("baseline", "random walk", "uard-paper", "uard-consistent", "uard-0.1", "uard"):
         for panel in ("main", "appendix"):
             if agent in ("baseline", "random walk") and panel == "appendix":
                 continue
@@ -57,7 +57,7 @@ def _table3(results: StudyResults) -> Table:
     ]
     for t in (100, 80):
         base = results.get("table3", "hacks", agent="baseline", horizon=t, panel="main")
-        for agent in ("baseline", "uard-paper", "uard-consistent", "uard", "random walk"):
+        for agent in ("baseline", "uard-paper", "uard-consistent", "uard-0.1", "uard", "random walk"):
             r = results.row("table3", agent=agent, horizon=t, panel="main")
             v, o, g, true = (results.of(r.cell, m) for m in ("hacks", "observed_return", "success_rate", "true_return"))
             cut = f"{100 * (1 - v.mean / base.mean):.1f} %"
@@ -82,8 +82,7 @@ def _table4(results: StudyResults) -> Table:
         for panel in ("main", "appendix"):
             rows.append(_row4(results, names[p.agent], panel))
     for panel in ("main", "appendix"):
-        rows.append(_row4(results, "uard-consistent", panel))
-        rows.append(_row4(results, "uard", panel))
+        rows += [_row4(results, agent, panel) for agent in ("uard-consistent", "uard-0.1", "uard")]
     return Table(
         "Table 4 (F4): 6x6",
         ("agent", "source", "true return", "observed return", "trap visits", "alignment gap", "goal rate"),
@@ -110,14 +109,14 @@ def _table5(results: StudyResults) -> Table:
     for p in paper.TABLE_5:
         name = variant.get(p.variant, p.variant)
         cells = []
-        for reading in ("uard-paper", "uard-consistent", "uard-operator", "uard"):
+        for reading in ("uard-paper", "uard-consistent", "uard-operator", "uard-0.1"):
             found = list(results.studies["table5"].where(variant=name, reading=reading if p.discounting else "-"))
             v, g = results.of(found[0].cell, "hacks"), results.of(found[0].cell, "success_rate")
             cells.append(f"{brief(v)} (goal {g.mean:.2f})")
         rows.append((p.variant, _stat(p.visits), *cells))
     return Table(
         "Table 5 (F5): which component does the work",
-        ("variant", "paper", "as printed (acts on J)", "consistent backup", "T_lambda (on reward)", "ours (uard)"),
+        ("variant", "paper", "as printed (acts on J)", "consistent backup", "T_lambda (on reward)", "ours (uard-0.1)"),
         tuple(rows),
         1,
         "Trap visits per episode, 6x6, main panel, heads bootstrapped with probability 0.5. Without sigma_h no reading of the paper works. Ours then still has its anchor and lambda_t, which come from the ratings too.",

@@ -35,11 +35,11 @@ def baselines() -> tuple[Row, ...]:
         for name, agent in AGENTS.items():
             if t == 100 or name != "cpo-oracle":
                 rows.append(row(cell(grid, RAW, agent), agent=name, mitigation="raw", horizon=t))
-        for mitigation in ("uard-paper", "uard") if t == 100 else ("uard",):
+        for mitigation in ("uard-paper", "uard-0.1") if t == 100 else ("uard-0.1",):
             rows.append(
                 row(cell(grid, named(mitigation), ENSEMBLE), agent="ensemble-dqn", mitigation=mitigation, horizon=t)
             )
-        rows.append(row(cell(grid, named("uard"), AGENTS["ppo"]), agent="ppo", mitigation="uard", horizon=t))
+        rows.append(row(cell(grid, named("uard-0.1"), AGENTS["ppo"]), agent="ppo", mitigation="uard-0.1", horizon=t))
     return tuple(rows)
 
 
@@ -53,10 +53,10 @@ EVERYWHERE = ("dqn", "ensemble-dqn", "ppo")
 
 
 def mitigated() -> tuple[Row, ...]:
-    """``uard`` with one setting, T = 100: three agents with +4 and +8 and both panels, the others with one of each."""
+    """``uard-0.1`` with one setting, T = 100: three agents with +4 and +8 and both panels, the others with one of each."""
     return tuple(
         row(
-            cell(TrapGrid(size=10, trap_reward=trap, horizon=100), named("uard"), agent, panel=as_panel(panel)),
+            cell(TrapGrid(size=10, trap_reward=trap, horizon=100), named("uard-0.1"), agent, panel=as_panel(panel)),
             agent=name,
             trap=trap,
             panel=panel,
@@ -69,7 +69,7 @@ def mitigated() -> tuple[Row, ...]:
     )
 
 
-RIVALS = ("mean-of-annotations", "worst-of-annotations", "lcb", "screening", "uard")
+RIVALS = ("mean-of-annotations", "worst-of-annotations", "lcb", "screening", "uard-0.1")
 
 
 def rivals() -> tuple[Row, ...]:
@@ -95,7 +95,7 @@ def ablation() -> tuple[Row, ...]:
         row(cell(grid, RAW, ENSEMBLE), variant="Ablation I", reading="-"),
         row(cell(grid, named("no-discount"), ENSEMBLE), variant="Ablation II", reading="-"),
     ]
-    for reading in ("uard-paper", "uard"):
+    for reading in ("uard-paper", "uard-0.1"):
         for variant, parameters in (("UARD-lite", {"beta": 0.0}), ("Human-only", {"alpha": 0.0}), ("UARD", {})):
             rows.append(row(cell(grid, named(reading, **parameters), ENSEMBLE), variant=variant, reading=reading))
     return tuple(rows)
@@ -119,7 +119,7 @@ def feedback() -> tuple[Row, ...]:
     """Running means or a model of the ratings, when 1 %, 10 % or all steps are rated."""
     return tuple(
         row(
-            cell(paper_grid(10), named("uard"), ENSEMBLE, rated=rated, rating_model=model),
+            cell(paper_grid(10), named("uard-0.1"), ENSEMBLE, rated=rated, rating_model=model),
             source=source,
             rated=rated,
         )
@@ -132,7 +132,7 @@ def distortion() -> tuple[Row, ...]:
     """Agents trained on the true reward, whose reward is distorted afterwards (``uard.replication.distortion``)."""
     honest = TrapGrid(size=6, trap_reward=-1.0)
     return (
-        row(cell(honest, named("uard"), ENSEMBLE), agent="uard"),
+        row(cell(honest, named("uard-0.1"), ENSEMBLE), agent="uard-0.1"),
         row(cell(honest, RAW, AGENTS["edac"]), agent="edac"),
         row(cell(honest, RAW, AGENTS["sunrise"]), agent="sunrise"),
     )

@@ -16,17 +16,19 @@ from uard.lab.study import Row, Study, row
 from uard.method.mitigations import named
 from uard.ratings.panels import as_panel
 from uard.replication.studies import derive
-from uard.training.feedback.transition_model import QUERIES
+from uard.training.feedback.transition_model import QUERIES, TransitionModel
 
 REGIONS = {"vibration": Vibration, "posture": Posture}
 RATED = 0.15
+RATINGS = TransitionModel(predicts="ratings")
 EARLY = 100  # few agents of the smaller sizes still stand at step 500
 NOISE_UNIT = Vibration().bonus  # the paper's noise is in per cent, of what it does not say: of the bonus, here
 RIVALS = ("mean-of-annotations", "worst-of-annotations", "lcb")
 
 
-def _cell(environment: Locomotion, mitigation: Any, agent: Any, steps: int, **more: Any) -> Cell:
-    return Cell(environment, mitigation, agent, rated=RATED, steps=steps, **more)
+def _cell(environment: Locomotion, mitigation: Any, agent: Any, steps: int, rated: float = RATED, **more: Any) -> Cell:
+    # The model of version 0.1, with which all of these were trained.
+    return Cell(environment, mitigation, agent, rated=rated, steps=steps, rating_model=RATINGS, **more)
 
 
 def _panels(mitigation: str) -> tuple[str, ...]:
@@ -75,7 +77,7 @@ def hacking(scale: Scale) -> tuple[Row, ...]:
     for robot in scale.robots:
         plain = Locomotion(robot, region=None)
         for name, (agent, steps) in scale.agents.items():
-            for mitigation in ("raw", "uard"):
+            for mitigation in ("raw", "uard-0.1"):
                 cell = _cell(plain, named(mitigation), agent, steps)
                 rows.append(row(cell, robot=robot, region="none", agent=name, mitigation=mitigation, panel="main"))
             for which, region in REGIONS.items():
@@ -84,7 +86,7 @@ def hacking(scale: Scale) -> tuple[Row, ...]:
                 for label, where, mitigation, panel in (
                     ("true reward", honest, RAW, "main"),
                     ("raw", lies, RAW, "main"),
-                    *((m, lies, named(m), p) for m in ("uard-paper", "uard") for p in PANELS),
+                    *((m, lies, named(m), p) for m in ("uard-paper", "uard-0.1") for p in PANELS),
                 ):
                     cell = _cell(where, mitigation, agent, steps, panel=as_panel(panel))
                     rows.append(row(cell, robot=robot, region=which, agent=name, mitigation=label, panel=panel))
@@ -104,7 +106,7 @@ def bonuses(scale: Scale) -> tuple[Row, ...]:
         )
         for which, region in REGIONS.items()
         for bonus in (4.0, 6.0, 8.0)
-        for mitigation in ("raw", "uard-operator", "uard")
+        for mitigation in ("raw", "uard-operator", "uard-0.1")
         for panel in _panels(mitigation)
     )
 
@@ -112,9 +114,9 @@ def bonuses(scale: Scale) -> tuple[Row, ...]:
 def noise(scale: Scale) -> tuple[Row, ...]:
     """Violations against rater noise of 0, 10, 20 and 30 % of the bonus (G11), Hopper, vibration.
 
-    PPO and SAC by themselves, which hear nothing of it, and with ``uard``; PPO also with what else listens to raters.
+    PPO and SAC by themselves, which hear nothing of it, and with ``uard-0.1``; PPO also with what else listens to raters.
     """
-    compared = {"ppo": ("raw", "uard", *RIVALS), "sac": ("raw", "uard")}
+    compared = {"ppo": ("raw", "uard-0.1", *RIVALS), "sac": ("raw", "uard-0.1")}
     return tuple(
         row(
             _cell(Locomotion(), named(mitigation), agent, steps, noise=share * NOISE_UNIT),
@@ -141,7 +143,7 @@ def kick(scale: Scale) -> tuple[Row, ...]:
             kicked=kicked,
             at=step,
         )
-        for mitigation in ("raw", "uard")
+        for mitigation in ("raw", "uard-0.1")
         for kicked, step, kick in kicks
     )
 
@@ -155,7 +157,9 @@ def ablation(scale: Scale) -> tuple[Row, ...]:
     }
     return tuple(
         row(
-            _cell(Locomotion(region=region()), named("uard", **changes), *scale.agents[name], panel=as_panel(panel)),
+            _cell(
+                Locomotion(region=region()), named("uard-0.1", **changes), *scale.agents[name], panel=as_panel(panel)
+            ),
             agent=name,
             region=which,
             variant=variant,
@@ -180,9 +184,9 @@ def distortion(scale: Scale) -> tuple[Row, ...]:
             critics=critics,
         )
         for name, critics, agent, mitigation in (
-            ("uard", "5, shared trunk", every["ensemble-sac"], named("uard")),
-            ("uard", "5, full", full, named("uard")),
-            ("uard (ppo)", "5, shared trunk", every["ppo"], named("uard")),
+            ("uard-0.1", "5, shared trunk", every["ensemble-sac"], named("uard-0.1")),
+            ("uard-0.1", "5, full", full, named("uard-0.1")),
+            ("uard-0.1 (ppo)", "5, shared trunk", every["ppo"], named("uard-0.1")),
             ("edac", "5, full", every["edac"], RAW),
             ("sunrise", "5, shared trunk", every["sunrise"], RAW),
         )
@@ -200,7 +204,7 @@ def legitimate(scale: Scale) -> tuple[Row, ...]:
             panel=panel,
         )
         for which, region in REGIONS.items()
-        for mitigation in ("raw", "uard")
+        for mitigation in ("raw", "uard-0.1")
         for panel in _panels(mitigation)
     )
 
@@ -211,15 +215,15 @@ def caution(scale: Scale) -> tuple[Row, ...]:
     plain = Locomotion(region=None)
     variants: dict[str, tuple[str, dict[str, Any], float]] = {
         "raw": ("raw", {}, RATED),
-        "uard": ("uard", {}, RATED),
-        "uard, every step rated": ("uard", {}, 1.0),
-        "uard, sigma_h only": ("uard", {"alpha": 0.0}, RATED),
-        "uard, sigma_m only": ("uard", {"beta": 0.0}, RATED),
+        "uard-0.1": ("uard-0.1", {}, RATED),
+        "uard-0.1, every step rated": ("uard-0.1", {}, 1.0),
+        "uard-0.1, sigma_h only": ("uard-0.1", {"alpha": 0.0}, RATED),
+        "uard-0.1, sigma_m only": ("uard-0.1", {"beta": 0.0}, RATED),
         "mean-of-annotations": ("mean-of-annotations", {}, RATED),
         "worst-of-annotations": ("worst-of-annotations", {}, RATED),
     }
     return tuple(
-        row(Cell(plain, named(mitigation, **changes), agent, rated=rated, steps=steps), learns_from=label)
+        row(_cell(plain, named(mitigation, **changes), agent, steps, rated=rated), learns_from=label)
         for label, (mitigation, changes, rated) in variants.items()
     )
 
@@ -229,7 +233,7 @@ def rating(scale: Scale) -> tuple[Row, ...]:
     agent, steps = scale.agents["ppo"]
     return tuple(
         row(
-            _cell(Locomotion(region=region()), named("uard"), agent, steps, panel=as_panel(panel), query=query),
+            _cell(Locomotion(region=region()), named("uard-0.1"), agent, steps, panel=as_panel(panel), query=query),
             region=which,
             panel=panel,
             query=query,

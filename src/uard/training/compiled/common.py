@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from uard.agents.networks import batched_index
 from uard.envs.tables import HiddenTruth
 from uard.envs.world import Step, TableWorld, World
 from uard.method.mitigations import Feedback, Mitigation
@@ -126,7 +125,8 @@ class FeedbackSource:
         slots = self.world.slots if self.used else 1
         model = ()
         if self.used and self.spec is not None:
-            model = rating_model.init(self.spec, key_of(self.seed, MODEL), self.world.features, self.world.actions)
+            key, world = key_of(self.seed, MODEL), self.world
+            model = rating_model.init(self.spec, key, world.features, world.actions, world.raters)
             model = model, self._table(model)
         return rating_model.memory(slots, state, self.world.raters), model
 
@@ -158,6 +158,7 @@ class FeedbackSource:
         if not self.used or self.spec is None:
             return model
         fitted = rating_model.fit(self.spec, model[0], known, self.world.observe, self.world.actions, key)
+        fitted = rating_model.with_noise(self.spec, fitted, known, self.world.observe, self.world.actions)
         return fitted, self._table(fitted)
 
     def panel_statistics(self, known: rating_model.Memory, model: Any) -> Any:
@@ -170,15 +171,20 @@ class FeedbackSource:
         """Return the feedback of every slot's state-action, (M,) arrays."""
         if self.spec is None:
             return from_rows(known.rows)
-        return self.of(known, model, known.states, known.actions)
+        return self.of(known, model, known.states, known.actions, from_rows(known.rows).proxy)
 
-    def of(self, known: rating_model.Memory, model: Any, states: Any, actions: Array) -> Feedback:
-        """Return the feedback of state-actions, (B,) arrays."""
+    def of(self, known: rating_model.Memory, model: Any, states: Any, actions: Array, reward: Array) -> Feedback:
+        """Return the feedback of state-actions with an observed reward, (B,) arrays."""
         if not self.used:
             return self._nothing(actions.shape)
         if self.spec is None:
             return from_rows(known.rows[jax.vmap(self.world.slot)(states, actions)])
-        return self.of_all(known, model, states).map(lambda x: batched_index(x, actions))
+        chosen = jnp.arange(self.world.actions) == actions[:, None]
+
+        def pick(x: Array) -> Array:  # (B, A) or, of each rater, (B, A, K)
+            return jnp.where(chosen.reshape(chosen.shape + (1,) * (x.ndim - 2)), x, 0.0).sum(1)
+
+        return rating_model.observing(self.of_all(known, model, states).map(pick), reward)
 
     def of_all(self, known: rating_model.Memory, model: Any, states: Any) -> Feedback:
         """Return the feedback of all actions in states, (B, A) arrays."""

@@ -92,7 +92,7 @@ def train_one(run: Run, program: Program) -> TrainedAgent:
         filled = jnp.minimum(c.steps + 1, agent.buffer)
         places = jax.random.randint(draw_key, (agent.batch,), 0, filled)
         drawn: _Row = jax.tree.map(lambda x: x[places], buffer)
-        feedback = source.of(c.known, c.model, drawn.state, drawn.action)
+        feedback = source.of(c.known, c.model, drawn.state, drawn.action, drawn.reward)
 
         def reward_fn(sigma_m: Array) -> LearningSignal:
             return mitigation.signal(Evidence(drawn.reward, jnp.hypot(sigma_m, drawn.doubt), feedback), c.statistics)

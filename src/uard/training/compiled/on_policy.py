@@ -134,7 +134,7 @@ def train_one(run: Run, program: Program) -> TrainedAgent:
         values, next_values = both[:, :total], both[:, total:]
         # There are no action values to disagree about: one step ahead, what the members say of the state it led to.
         ahead = jnp.where(after.terminated, 0.0, agent.gamma * networks.mean_and_deviation(next_values)[1])
-        feedback = source.of(c.known, c.model, flat.state, flat.action)
+        feedback = source.of(c.known, c.model, flat.state, flat.action, after.reward)
         signal = mitigation.signal(Evidence(after.reward, jnp.hypot(ahead, after.doubt), feedback), statistics)
         bonus = agent.count_bonus / jnp.sqrt(c.visits[jax.vmap(world.slot)(flat.state, flat.action)])
 

@@ -1,14 +1,15 @@
 """What a deep learner knows of its raters: a memory of distinct rated steps, and a model of ratings for all others.
 
 ``Memory`` has the tabular learner's rows of feedback, one per slot, with the state-action behind it.
-``RatingModel`` regresses them: a small ensemble with fixed random priors predicts the mean rating, the lowest, their
-deviation sigma_h and the observed reward of any state-action, and how much it knows of it. Both answer with the same
-``Feedback``, so no mitigation can tell which of them it is given.
+``RatingModel`` regresses them: a small ensemble with fixed random priors predicts, of any state-action, the gap between
+each rater's mean rating and the observed reward, that of the lowest rating, their deviation sigma_h and the observed
+reward, and how much it knows of them. Both answer with the same ``Feedback``, so no mitigation can tell which of them
+it is given: a rater's prediction counts as many answers as its variance, over members, goes into that of one answer.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
@@ -18,10 +19,10 @@ from jax import Array, lax
 
 from uard import _checks
 from uard.agents.networks import Layer, descend, mlp, through
-from uard.method.mitigations import Feedback
+from uard.method.feedback import ByRater, Feedback
 from uard.ratings.aggregate import empty_rows, from_rows, merged, to_rows
 
-OUTPUTS = 4  # mean, lowest, sd, proxy
+REST = 3  # outputs after those of the raters: lowest, sd, proxy
 
 
 class Memory(NamedTuple):
@@ -85,6 +86,8 @@ class RatingModel:
         batch: Distinct rated steps per minibatch, in [1, 65536].
         prior_scale: Size of the fixed random functions that make members disagree where nobody rated, in units of the
             ratings' deviation, > 0.
+        predicts: ``gaps`` between ratings and observed reward, of each rater; or the ``ratings`` of all together, as
+            version 0.1 did.
     """
 
     members: int = 5
@@ -93,6 +96,7 @@ class RatingModel:
     fits: int = 16
     batch: int = 128
     prior_scale: float = 1.0
+    predicts: str = field(default="gaps", metadata={"omitted_at": "ratings"})
 
     def __post_init__(self) -> None:
         """Check the parameters.
@@ -106,32 +110,43 @@ class RatingModel:
         _checks.whole("fits", self.fits, low=1, high=10_000)
         _checks.whole("batch", self.batch, low=1, high=65_536)
         _checks.number("prior_scale", self.prior_scale, low=0, open_low=True)
+        _checks.choose("predicts", self.predicts, ("gaps", "ratings"))
+
+    def outputs(self, raters: int) -> int:
+        """Return how many numbers are predicted of a state-action."""
+        return (raters if self.predicts == "gaps" else 1) + REST
 
 
 class Model(NamedTuple):
-    """Trained and fixed layers, Adam's moments, and the units (OUTPUTS,) of location and scale."""
+    """Trained and fixed layers, Adam's moments, and the units (outputs,) of location and scale.
+
+    The last is the variance (K,) of one answer of each rater about its prediction; negative for who never answered.
+    """
 
     layers: tuple[Layer, ...]
     prior: tuple[Layer, ...]
     optimiser: Any
     location: Array
     scale: Array
+    noise: Array
 
 
-def init(spec: RatingModel, key: Array, features: int, actions: int) -> Model:
+def init(spec: RatingModel, key: Array, features: int, actions: int, raters: int) -> Model:
     """Draw a fresh model."""
     own, fixed = jax.random.split(key)
-    sizes = (features, spec.hidden, actions * OUTPUTS)
+    outputs = spec.outputs(raters)
+    sizes = (features, spec.hidden, actions * outputs)
     layers = mlp(own, sizes, spec.members, last_gain=0.1)
     prior = mlp(fixed, sizes, spec.members)
-    ones = jnp.ones(OUTPUTS, jnp.float32)
-    return Model(layers, prior, optax.adam(spec.learning_rate).init(layers), 0.0 * ones, ones)
+    ones = jnp.ones(outputs, jnp.float32)
+    silent = jnp.full(raters, -1.0, jnp.float32)
+    return Model(layers, prior, optax.adam(spec.learning_rate).init(layers), 0.0 * ones, ones, silent)
 
 
 def _predict(spec: RatingModel, layers: Any, prior: Any, observations: Array, actions: int) -> Array:
-    """Return (members, B, actions, OUTPUTS), in units of the ratings' deviation."""
+    """Return (members, B, actions, outputs), in units of the observed reward's deviation."""
     out = through(layers, observations) + spec.prior_scale * lax.stop_gradient(through(prior, observations))
-    return out.reshape(*out.shape[:2], actions, OUTPUTS)
+    return out.reshape(*out.shape[:2], actions, -1)
 
 
 def read(spec: RatingModel, model: Model, observations: Array, actions: int, raters: int) -> Feedback:
@@ -144,18 +159,56 @@ def read(spec: RatingModel, model: Model, observations: Array, actions: int, rat
     before = spec.prior_scale**2 * through(model.prior, observations).var(0, ddof=1).mean(-1)
     after = out.var(0, ddof=1).mean(-1)
     count = jnp.maximum(before[:, None] / jnp.maximum(after, 1e-6) - 1.0, 0.0)
-    mean, lowest, sd, proxy = jnp.moveaxis(model.location + model.scale * out.mean(0), -1, 0)
-    return Feedback(count, mean, lowest, jnp.maximum(sd, 0.0), proxy, jnp.full_like(mean, raters))
+    predicted = model.location + model.scale * out.mean(0)
+    lowest, sd, proxy = jnp.moveaxis(predicted[..., -REST:], -1, 0)
+    everybody = jnp.full_like(proxy, raters)
+    if spec.predicts == "ratings":
+        return Feedback(count, predicted[..., 0], lowest, jnp.maximum(sd, 0.0), proxy, everybody)
+    heard = model.noise >= 0
+    noise = jnp.where(heard, model.noise, 0.0)
+    variance = (model.scale * out)[..., :raters].var(0, ddof=1)
+    answers = jnp.where(heard, noise / jnp.maximum(variance, 1e-6 * model.scale[0] ** 2), 0.0)
+    ratings = proxy[..., None] + predicted[..., :raters]
+    mean = jnp.where(heard, ratings, 0.0).sum(-1) / jnp.maximum(heard.astype(jnp.float32).sum(), 1.0)
+    by_rater = ByRater(answers, ratings, noise * jnp.maximum(answers - 1.0, 0.0))
+    return Feedback(count, mean, proxy + lowest, jnp.maximum(sd, 0.0), proxy, everybody, by_rater)
+
+
+def observing(predicted: Feedback, reward: Array) -> Feedback:
+    """Return predictions of steps whose reward was observed: the gaps are then added to that, not to a prediction."""
+    if predicted.by_rater is None:
+        return predicted
+    shift = reward - predicted.proxy
+    each = predicted.by_rater
+    return predicted._replace(
+        mean=predicted.mean + shift,
+        lowest=predicted.lowest + shift,
+        proxy=reward,
+        by_rater=each._replace(mean=each.mean + shift[..., None]),
+    )
+
+
+def _targets(spec: RatingModel, feedback: Feedback) -> tuple[Array, Array]:
+    """Return what is to be predicted of every slot, (M, outputs), and which of it is known."""
+    rated = (feedback.count > 0)[:, None]
+    if spec.predicts == "ratings":
+        targets = jnp.stack([feedback.mean, feedback.lowest, feedback.sd, feedback.proxy], axis=-1)
+        return targets, jnp.broadcast_to(rated, targets.shape)
+    assert feedback.by_rater is not None
+    proxy = feedback.proxy[:, None]
+    rest = jnp.stack([feedback.lowest - feedback.proxy, feedback.sd, feedback.proxy], axis=-1)
+    targets = jnp.concatenate([feedback.by_rater.mean - proxy, rest], axis=-1)
+    here = jnp.concatenate([feedback.by_rater.count > 0, jnp.broadcast_to(rated, rest.shape)], axis=-1)
+    return targets, here & rated
 
 
 def fit(spec: RatingModel, model: Model, known: Memory, observe: Any, actions: int, key: Array) -> Model:
     """Train for ``fits`` minibatches of distinct rated steps; unchanged before the first rating."""
     feedback = from_rows(known.rows)
-    rated = (feedback.count > 0)[:, None]
-    total = jnp.maximum(rated.sum(), 1).astype(jnp.float32)
-    targets = jnp.stack([feedback.mean, feedback.lowest, feedback.sd, feedback.proxy], axis=-1)
-    location = jnp.where(rated, targets, 0.0).sum(0) / total
-    deviation = jnp.sqrt((jnp.where(rated, targets - location, 0.0) ** 2).sum(0) / total)
+    targets, here = _targets(spec, feedback)
+    total = jnp.maximum(here.sum(0), 1).astype(jnp.float32)
+    location = jnp.where(here, targets, 0.0).sum(0) / total
+    deviation = jnp.sqrt((jnp.where(here, targets - location, 0.0) ** 2).sum(0) / total)
     # One unit for all: the observed reward's deviation, as the mitigations' own.
     unit = jnp.where(deviation[-1] > 0, deviation[-1], 1.0)
     scale = jnp.full_like(deviation, 1.0) * unit
@@ -167,16 +220,33 @@ def fit(spec: RatingModel, model: Model, known: Memory, observe: Any, actions: i
         states = jax.tree.map(lambda x: x[drawn], known.states)
         observations = jax.vmap(observe)(states)
         target = (targets[drawn] - location) / scale
-        here = jnp.arange(actions) == known.actions[drawn][:, None]
+        wanted = (jnp.arange(actions) == known.actions[drawn][:, None])[:, :, None] & here[drawn][:, None]
 
         def loss(layers: Any) -> Array:
             out = _predict(spec, layers, model.prior, observations, actions)
             each = optax.losses.huber_loss(out, target[None, :, None])
-            return jnp.where(here[:, :, None], each, 0.0).sum() / spec.batch
+            return jnp.where(wanted, each, 0.0).sum() / spec.batch
 
         gradient = jax.grad(loss)(layers)
         after = descend(spec.learning_rate, gradient, optimiser, layers)
         return jax.tree.map(lambda new, old: jnp.where(some, new, old), after, carry), None
 
     (layers, optimiser), _ = lax.scan(one, (model.layers, model.optimiser), jax.random.split(key, spec.fits))
-    return Model(layers, model.prior, optimiser, location, scale)
+    return Model(layers, model.prior, optimiser, location, scale, model.noise)
+
+
+def with_noise(spec: RatingModel, model: Model, known: Memory, observe: Any, actions: int) -> Model:
+    """Measure how far each rater's answers lie from their predictions, over the distinct rated state-actions."""
+    if spec.predicts == "ratings":
+        return model
+    feedback = from_rows(known.rows)
+    assert feedback.by_rater is not None
+    count, _, m2 = feedback.by_rater
+    targets, here = _targets(spec, feedback)
+    raters = count.shape[-1]
+    out = _predict(spec, model.layers, model.prior, jax.vmap(observe)(known.states), actions).mean(0)
+    predicted = (model.location + model.scale * out)[jnp.arange(len(count)), known.actions, :raters]
+    each = m2 / jnp.maximum(count, 1.0) + (predicted - targets[:, :raters]) ** 2
+    answered = here[:, :raters].astype(jnp.float32).sum(0)
+    mean = jnp.where(here[:, :raters], each, 0.0).sum(0) / jnp.maximum(answered, 1.0)
+    return model._replace(noise=jnp.where(answered > 0, mean, -1.0))

@@ -1,11 +1,18 @@
 """What a learner in a continuous world knows of its raters: a sample of rated steps, and a model for all others.
 
 No step comes twice, so there are no running means. ``Reservoir`` is a uniform sample of all steps rated so far (it must
-not forget what honest steps look like when the agent no longer takes them); ``TransitionModel`` regresses each rater's
-rating, and how far apart the raters are, on (s, a, s', observed reward). sigma_h of a step is composed at use from the
-predicted ratings and the reward that was observed, which tells hacks apart far better than a predicted deviation. The
-lowest rating is that of the rater who is predicted to say least: what the lowest of several noisy ratings is on average
-sinks with the noise, and an agent that can end its episode then prefers to fall.
+not forget what honest steps look like when the agent no longer takes them); ``TransitionModel`` regresses, for each
+rater, the gap between rating and observed reward, and how far apart the raters are, on (s, a, s', observed reward).
+Where rewards tell the truth gaps are small, whatever the rewards are: the model distorts them far less than one of the
+ratings themselves, which version 0.1 had.
+
+A rater's prediction is worth as many answers as its variance, over members, goes into that of one answer: that is the
+rater's ``count``, and the rules that ask who said what need not know that a model has answered.
+
+sigma_h of a step is composed at use from the predicted ratings and the reward that was observed, which tells hacks
+apart far better than a predicted deviation. The lowest rating is that of the rater who is predicted to say least: what
+the lowest of several noisy ratings is on average sinks with the noise, and an agent that can end its episode then
+prefers to fall.
 
 Noise also makes predictions err, so that raters seem to differ, and steps to be disputed, where nothing is. Only that
 part of a difference counts that is more than the members' own deviation (``soft_threshold``).
@@ -14,7 +21,7 @@ part of a difference counts that is more than the members' own deviation (``soft
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -26,11 +33,12 @@ from jax import Array, lax
 
 from uard import _checks
 from uard.agents.networks import Layer, descend, mlp, through
-from uard.method.feedback import Feedback
+from uard.method.feedback import ByRater, Feedback
 from uard.method.mitigations import Mitigation, PanelStatistics
 from uard.ratings.aggregate import aggregate
 
 QUERIES = ("random", "doubtful")  # which steps are rated
+BINS, SPREAD = 64, 2048  # of observed rewards; steps over which statistics of the panel are taken
 
 
 @dataclass(frozen=True)
@@ -56,6 +64,7 @@ class TransitionModel:
         capacity: Rated steps kept, >= ``batch``.
         deviations: Deviations of the members, >= 0, by which differences are reduced before they count; see
             ``soft_threshold``.
+        predicts: ``gaps`` between ratings and observed reward, or the ``ratings`` themselves, as version 0.1 did.
     """
 
     members: int = 5
@@ -66,6 +75,7 @@ class TransitionModel:
     prior_scale: float = 1.0
     capacity: int = 16_384
     deviations: float = 1.0
+    predicts: str = field(default="gaps", metadata={"omitted_at": "ratings"})
 
     def __post_init__(self) -> None:
         """Check the parameters.
@@ -81,6 +91,7 @@ class TransitionModel:
         _checks.number("prior_scale", self.prior_scale, low=0, open_low=True)
         _checks.whole("capacity", self.capacity, low=self.batch, high=10_000_000)
         _checks.number("deviations", self.deviations, low=0)
+        _checks.choose("predicts", self.predicts, ("gaps", "ratings"))
 
 
 class Reservoir(NamedTuple):
@@ -88,12 +99,14 @@ class Reservoir(NamedTuple):
 
     Attributes:
         inputs: (M, features) of the steps.
-        targets: (M, K + 1), each rater's rating (NaN where one is missing), and their deviation.
+        targets: (M, K + 1), each rater's rating (0 where one is missing), and their deviation.
+        answered: (M, K + 1), whether it is there.
         seen: (1,), how many steps were rated so far.
     """
 
     inputs: np.ndarray
     targets: np.ndarray
+    answered: np.ndarray
     seen: np.ndarray
 
 
@@ -111,7 +124,7 @@ def width(features: int, actions: int) -> int:
 def empty(spec: TransitionModel, width: int, raters: int) -> Reservoir:
     """Return a reservoir of nothing."""
     inputs, targets = (np.zeros((spec.capacity, w), np.float32) for w in (width, raters + 1))
-    return Reservoir(inputs, targets, np.zeros(1, np.int64))
+    return Reservoir(inputs, targets, np.zeros(targets.shape, bool), np.zeros(1, np.int64))
 
 
 def keep(
@@ -120,11 +133,13 @@ def keep(
     """Put rated steps into the sample [Vitter 1985, algorithm R]; ratings (B, K), NaN where one is missing."""
     capacity = len(reservoir.inputs)
     targets = np.column_stack([ratings, aggregate(ratings, np.zeros(len(ratings)), ddof=ddof).sd])
+    answered = ~np.isnan(targets)
+    rows = inputs, np.where(answered, targets, 0.0), answered
     numbers = reservoir.seen[0] + np.arange(len(inputs))
     places = np.where(numbers < capacity, numbers, random.integers(0, numbers + 1))
-    for place, x, y in zip(places, inputs, targets, strict=True):  # in order: a later one may take an earlier's place
-        if place < capacity:
-            reservoir.inputs[place], reservoir.targets[place] = x, y
+    kept = places < capacity
+    for table, new in zip(reservoir[:3], rows, strict=True):
+        table[places[kept]] = new[kept]  # where two take one place, NumPy leaves the later
     reservoir.seen[0] += len(inputs)
 
 
@@ -151,7 +166,10 @@ def chosen(query: str, share: float, knows: Callable[[], np.ndarray], rows: int,
 
 
 class Model(NamedTuple):
-    """Layers, Adam's moments, and the units: location and scale of the inputs, location and scale of the targets."""
+    """Layers, Adam's moments, and the units: location and scale of the inputs, location and scale of the targets.
+
+    The last is the variance (K,) of one answer of each rater about its prediction; negative for who never answered.
+    """
 
     layers: tuple[Layer, ...]
     prior: tuple[Layer, ...]
@@ -160,6 +178,7 @@ class Model(NamedTuple):
     width: Array
     location: Array
     scale: Array
+    noise: Array
 
 
 def init(spec: TransitionModel, key: Array, width: int, raters: int) -> Model:
@@ -169,7 +188,8 @@ def init(spec: TransitionModel, key: Array, width: int, raters: int) -> Model:
     prior = mlp(fixed, (width, spec.hidden, raters + 1), spec.members)
     zeros, ones = jnp.zeros(width, jnp.float32), jnp.ones(width, jnp.float32)
     location = jnp.zeros(raters + 1, jnp.float32)
-    return Model(layers, prior, optax.adam(spec.learning_rate).init(layers), zeros, ones, location, jnp.float32(1.0))
+    optimiser, silent = optax.adam(spec.learning_rate).init(layers), jnp.full(raters, -1.0, jnp.float32)
+    return Model(layers, prior, optimiser, zeros, ones, location, jnp.float32(1.0), silent)
 
 
 def _predict(spec: TransitionModel, layers: Any, prior: Any, inputs: Array) -> Array:
@@ -202,12 +222,18 @@ def read(spec: TransitionModel, model: Model, inputs: Array, raters: int) -> Fee
     count = jnp.maximum(before / jnp.maximum(after, 1e-6) - 1.0, 0.0)
     predicted = model.location + model.scale * out
     ratings = predicted[..., :-1]
+    if spec.predicts == "gaps":
+        ratings = ratings + inputs[:, -1:]
     means = ratings.mean(-1, keepdims=True)
     mean = means.mean((0, 2))
     lowest = mean + soft_threshold(ratings - means, spec.deviations).min(-1)
     typical = model.location[-1]
     sd = jnp.maximum(typical + soft_threshold(predicted[..., -1] - typical, spec.deviations), 0.0)
-    return Feedback(count, mean, lowest, sd, inputs[:, -1], jnp.full_like(mean, raters))
+    heard = model.noise >= 0
+    noise = jnp.where(heard, model.noise, 0.0)
+    answers = jnp.where(heard, noise / jnp.maximum(ratings.var(0, ddof=1), 1e-6 * model.scale**2), 0.0)
+    by_rater = ByRater(answers, ratings.mean(0), noise * jnp.maximum(answers - 1.0, 0.0))
+    return Feedback(count, mean, lowest, sd, inputs[:, -1], jnp.full_like(mean, raters), by_rater)
 
 
 @partial(jax.jit, static_argnames="spec")
@@ -219,7 +245,7 @@ def worth(spec: TransitionModel, model: Model, inputs: Array) -> Array:
 def nothing(rows: int) -> Feedback:
     """Return the feedback of steps that nobody was asked about."""
     none = jnp.zeros(rows, jnp.float32)
-    return Feedback(none, none, none, none, none, none)
+    return Feedback(none, none, none, none, none, none, ByRater(*(jnp.zeros((rows, 1), jnp.float32),) * 3))
 
 
 def panel_statistics(
@@ -237,8 +263,39 @@ def panel_statistics(
     """
     if model == ():
         return mitigation.fit(nothing(1), jnp.zeros(1, bool))
-    feedback = read(spec, model, sample, raters)
-    return mitigation.fit(feedback, (jnp.arange(sample.shape[0]) < seen) & (feedback.count > 0))
+    if spec.predicts == "ratings":
+        feedback, known = read(spec, model, sample, raters), jnp.arange(sample.shape[0]) < seen
+    else:
+        places, known = distinct(sample[:, -1], seen)
+        feedback = read(spec, model, sample[places], raters)
+    return mitigation.fit(feedback, known & (feedback.count > 0))
+
+
+def distinct(reward: Array, seen: Array) -> tuple[Array, Array]:
+    """Choose steps whose observed rewards are spread evenly, and say which of the chosen ones count.
+
+    In tables statistics are taken over distinct state-actions. Here no step comes twice, but an agent that sits in a
+    trap fills the sample with it, and what raters say of the lie would be taken for their bias.
+
+    Examples:
+        >>> reward = jnp.array([0.0, 5.0, 5.0, 5.0, 5.0, 5.0])
+        >>> places, known = distinct(reward, jnp.asarray(6))
+        >>> reward[places[known]].tolist().count(0.0) / int(known.sum()) >= 1 / 6
+        True
+
+    Args:
+        reward: (M,) of the sampled steps.
+        seen: How many of them there are.
+    """
+    here = jnp.arange(reward.shape[0]) < seen
+    low, high = jnp.nanquantile(jnp.where(here, reward, jnp.nan), jnp.array([0.01, 0.99]))
+    place = jnp.clip(BINS * (reward - low) / jnp.maximum(high - low, 1e-6), 0, BINS - 1)
+    place = jnp.where(here, place, 0).astype(jnp.int32)
+    one = here.astype(jnp.float32)
+    weight = one / jnp.maximum(jnp.bincount(place, one, length=BINS), 1.0)[place]
+    total = jnp.cumsum(weight)
+    chosen = jnp.searchsorted(total, total[-1] * (jnp.arange(SPREAD) + 0.5) / SPREAD)
+    return chosen, (seen > 0) & (jnp.diff(chosen, prepend=-1) > 0)
 
 
 def expecting(statistics: Any, feedback: Feedback) -> Any:
@@ -252,28 +309,31 @@ def expecting(statistics: Any, feedback: Feedback) -> Any:
 
 def fit(spec: TransitionModel, model: Model, reservoir: Reservoir, key: Array) -> Model:
     """Train for ``fits`` minibatches of what the reservoir holds; unchanged before the first rating."""
-    gaps = bool(np.isnan(reservoir.targets).any())
-    return _fit(spec, model, reservoir.inputs, reservoir.targets, reservoir.seen[0], key, gaps=gaps)
+    return _fit(spec, model, *reservoir[:3], reservoir.seen[0], key)
 
 
-@partial(jax.jit, static_argnames=("spec", "gaps"))
+@partial(jax.jit, static_argnames="spec")
 def _fit(
-    spec: TransitionModel, model: Model, inputs: Array, targets: Array, seen: Array, key: Array, *, gaps: bool
+    spec: TransitionModel, model: Model, inputs: Array, targets: Array, answered: Array, seen: Array, key: Array
 ) -> Model:
-    """Train on the first ``seen`` rows; with ``gaps`` a target of NaN is a rating that is missing."""
+    """Train on the first ``seen`` rows."""
     filled = jnp.minimum(seen, inputs.shape[0])
     mask = (jnp.arange(inputs.shape[0]) < filled)[:, None]
+    here = mask & answered
 
     def moments(x: Array, here: Array) -> tuple[Array, Array]:
-        total = jnp.maximum(here.sum(0), 1).astype(jnp.float32) if gaps else jnp.maximum(filled, 1).astype(jnp.float32)
+        total = jnp.maximum(here.sum(0), 1).astype(jnp.float32)
         centre = jnp.where(here, x, 0.0).sum(0) / total
         return centre, jnp.sqrt(jnp.where(here, (x - centre) ** 2, 0.0).sum(0) / total)
 
     centre, width = moments(inputs, mask)
-    location, deviation = moments(targets, mask & ~jnp.isnan(targets) if gaps else mask)
+    location, deviation = moments(targets, here)
     width = jnp.where(width > 1e-6, width, 1.0)
     typical = deviation[:-1].mean()
     scale = jnp.where(typical > 1e-6, typical, 1.0)
+    if spec.predicts == "gaps":
+        targets = targets.at[:, :-1].add(-inputs[:, -1:])
+        location = moments(targets, here)[0]
     model = model._replace(centre=centre, width=width, location=location, scale=scale)
 
     def one(carry: tuple[Any, Any], k: Array) -> tuple[tuple[Any, Any], None]:
@@ -284,9 +344,8 @@ def _fit(
 
         def loss(layers: Any) -> Array:
             out = _predict(spec, layers, model.prior, x)
-            # A missing rating is as if it had been predicted.
-            aim = jnp.where(jnp.isnan(target), lax.stop_gradient(out), target) if gaps else target
-            return optax.losses.huber_loss(out, aim).mean((1, 2)).sum()
+            each = jnp.where(answered[drawn], optax.losses.huber_loss(out, target), 0.0)
+            return each.mean((1, 2)).sum()
 
         return descend(spec.learning_rate, jax.grad(loss)(layers), optimiser, layers), None
 
@@ -294,4 +353,8 @@ def _fit(
     layers, optimiser = jax.tree.map(
         lambda new, old: jnp.where(filled > 0, new, old), carry, (model.layers, model.optimiser)
     )
-    return model._replace(layers=layers, optimiser=optimiser)
+    apart = location + scale * _predict(spec, layers, model.prior, _normal(model, inputs)).mean(0) - targets
+    answers = here[:, :-1].astype(jnp.float32).sum(0)
+    square = jnp.where(here[:, :-1], apart[:, :-1] ** 2, 0.0).sum(0)
+    noise = jnp.where(answers > 0, square / jnp.maximum(answers, 1.0), -1.0)
+    return model._replace(layers=layers, optimiser=optimiser, noise=noise)
