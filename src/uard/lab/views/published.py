@@ -256,6 +256,13 @@ class Published:
 def read_file(path: str) -> Any:
     """Return what ``uard reproduce --extract`` wrote.
 
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     _ = Path(folder, "mine.json").write_text('{"cells": {}}')
+        ...     read_file(f"{folder}/mine.json")
+        {'cells': {}}
+
     Raises:
         InvalidValueError: it cannot be read.
     """
