@@ -110,6 +110,9 @@ class Reproduce:
         from uard.lab.views.published import Published, read_file
 
         results = Published([study], [read_file(str(self.published))])
+        if missing := len(study.rows) - len(results.rows(study.name)):
+            allowed = f"a file with all rows of {study.name}: {missing} of {len(study.rows)} are not in it"
+            raise InvalidValueError("published", self.published, allowed)
         self._show_panels(study, results.per_seed, results.seeds(study.name), console)
 
     def _show_panels(self, study: Study, per_seed: PerSeed, seeds: int, console: Console) -> None:
