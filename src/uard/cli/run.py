@@ -39,7 +39,7 @@ class Run:
     set_mitigation: Pairs = ()
     """Change a field of the mitigation, e.g. lam=5 or kappa=0. Repeatable."""
     panel: str = "main"
-    """Who rates."""
+    """Who rates: a name, random:SEED, or random:SEED:SCALE for rewards of another size than a grid's."""
     noise: float = 0.0
     """Standard deviation of extra noise on every rater, in reward units."""
     noise_fraction: float | None = None
@@ -70,10 +70,13 @@ class Run:
         from uard.lab.execution.store import Store
         from uard.lab.result import summaries
         from uard.lab.study import results_of
+        from uard.ratings.panels import RANDOM, as_panel, composition
 
         _checks.whole("seeds", self.seeds, low=1, high=100_000)
         terminal.check_json(self.json, self.store)
         cell, trap_reward = self._cell()
+        if self.panel.startswith(RANDOM):
+            terminal.say(console, f"{self.panel}: {composition(as_panel(self.panel))}")
         store = Store(":memory:" if self.store is None else self.store)
         seeds = range(self.seeds)
         started = time.perf_counter()
