@@ -7,9 +7,9 @@ of NumPy, JAX or torch arrays.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from uard.method.arrays import Array, Numbers, namespace
+from uard.method.arrays import Array, Numbers, namespace, smallest
 from uard.method.feedback import ByRater
 from uard.method.uncertainty import masked_mean, root
 
@@ -270,19 +270,17 @@ def leave_one_out_medians(
         reward: Observed.
     """
     xp = namespace(said)
-    top = xp.full_like(said, xp.finfo(said.dtype).max)
-    values = xp.concat([reward[:, None], xp.where(here, said, top)], axis=-1)
-    order = xp.argsort(values, axis=-1)
-    place = xp.argsort(order, axis=-1)[:, 1:]  # of each rater among all
-    ranked = xp.take_along_axis(values, order, axis=-1)
-    left = xp.sum(xp.astype(here, place.dtype), axis=-1)[:, None] + xp.zeros_like(place)  # with the reward, without k
+    values = xp.concat([reward[:, None], xp.where(here, said, xp.full_like(said, xp.finfo(said.dtype).max))], axis=-1)
+    left = _number(here, axis=-1)  # how many values there are, with the reward and without the rater
+    last = values.shape[-1] - 1
+    low, high = xp.maximum(left - 1, 0 * left) // 2, left // 2
+    ranked = smallest(values, xp.clip(xp.concat([low, low + 1, high, high + 1], axis=-1), 0, last), axis=-1)
 
-    def without(index: Array) -> Float[Array, "n K"]:
-        return xp.take_along_axis(ranked, index + xp.astype(index >= place, index.dtype), axis=-1)
+    def without(first: int) -> Float[Array, "n K"]:
+        here, following = ranked[:, first : first + 1], ranked[:, first + 1 : first + 2]
+        return xp.where(said > here, here, following)
 
-    last = ranked.shape[-1] - 2
-    low, high = xp.clip((left - 1) // 2, 0, last), xp.clip(left // 2, 0, last)
-    return xp.where(here, 0.5 * without(low) + 0.5 * without(high), xp.zeros_like(said))
+    return xp.where(here, 0.5 * without(0) + 0.5 * without(2), xp.zeros_like(said))
 
 
 def masked_median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis: int = 0) -> Float[Array, "*rest"]:
@@ -293,8 +291,8 @@ def masked_median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis:
         >>> float(masked_median(np.array([1.0, 3.0, 4.0, 99.0]), np.array([True, True, True, False])))
         3.0
     """
-    low, high = _middles(values, mask, axis)
-    return 0.5 * low + 0.5 * high
+    number = _number(mask, axis)
+    return _median(values, mask, namespace(number).concat([(number - 1) // 2, number // 2], axis=axis), axis)
 
 
 def lower_median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis: int = 0) -> Float[Array, "*rest"]:
@@ -305,17 +303,18 @@ def lower_median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis: 
         >>> float(lower_median(np.array([1.0, 3.0, 4.0, 99.0]), np.array([True, True, False, False])))
         1.0
     """
-    return _middles(values, mask, axis)[0]
+    return _median(values, mask, (_number(mask, axis) - 1) // 2, axis)
 
 
-def _middles(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis: int) -> tuple[Any, Any]:
+def _number(mask: Bool[Array, "*any"], axis: int) -> Array:
+    xp = namespace(mask)
+    return xp.sum(xp.astype(mask, xp.int64 if hasattr(mask, "detach") else xp.int32), axis=axis, keepdims=True)
+
+
+def _median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], index: Array, axis: int) -> Float[Array, "*rest"]:
+    """Return the mean of the order statistics of the masked-in values at these indices, 0 where there are no values."""
     xp = namespace(values)
-    ranked = xp.sort(xp.where(mask, values, xp.full_like(values, xp.finfo(values.dtype).max)), axis=axis)
-    count = xp.sum(xp.astype(mask, xp.int64 if hasattr(values, "detach") else xp.int32), axis=axis, keepdims=True)
-    one = xp.ones_like(count)
-
-    def at(index: Array) -> Array:
-        found = xp.squeeze(xp.take_along_axis(ranked, index, axis=axis), axis=axis)
-        return xp.where(xp.squeeze(count, axis=axis) > 0, found, 0.0 * found)
-
-    return at(xp.maximum(count - one, 0 * one) // 2), at(xp.minimum(count // 2, one * (values.shape[axis] - 1)))
+    top = xp.full_like(values, xp.finfo(values.dtype).max)
+    found = smallest(xp.where(mask, values, top), xp.maximum(index, 0 * index), axis)
+    middle = xp.sum(found / found.shape[axis], axis=axis)
+    return xp.where(xp.any(mask, axis=axis), middle, xp.zeros_like(middle))
