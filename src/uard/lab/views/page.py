@@ -19,7 +19,7 @@ from uard._support import files
 from uard.lab import studies
 from uard.lab.execution.store import Store
 from uard.lab.result import WINDOW
-from uard.lab.views import best_of_n, figures, games, grids, leaderboard, panels, published, sections
+from uard.lab.views import best_of_n, figures, games, grids, leaderboard, panels, published, robots, sections
 from uard.lab.views.sections import Section
 from uard.lab.views.study_results import StudyResults
 from uard.lab.views.tables import study_table
@@ -49,7 +49,14 @@ def write(
         LookupError: a study is not finished.
     """
     results = StudyResults(store, seeds, studies.find(("grid",), mitigations))
-    ours = [_ours(results), *_panels(), _games(), _best_of_n(), _made(store, len(results.seeds))]
+    ours = [
+        _ours(results),
+        *_panels(),
+        *robots.section(published.packaged()),
+        _games(),
+        _best_of_n(),
+        _made(store, len(results.seeds)),
+    ]
     theirs, broken = sections.of_packages(results, [*ours, _losses(())])
     every = sorted([*ours, *theirs], key=lambda s: s.order)
     page = write_page(folder, [*every, _losses(every)], len(results.seeds), [(_LEADERBOARD, "leaderboard.html")])

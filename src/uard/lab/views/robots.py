@@ -1,0 +1,178 @@
+"""Hopper and Walker2d with a reward that lies: what every listener leaves of hacks and of the true return."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from uard.lab.statistics import Family
+from uard.lab.study import Row
+from uard.lab.views.published import Published
+from uard.lab.views.sections import Section
+from uard.lab.views.tables import Table, bounds, number
+from uard.lab.views.templates import table
+
+STUDY, NOISE = "robots", "robots-noise"
+OURS = "uard"
+REFERENCES = ("raw", "true reward")  # neither listens
+SIMPLE = ("mean-of-annotations", "median")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A robot, a region and a panel.
+
+    Attributes:
+        robot: Which.
+        region: Where its reward lies; none where it does not.
+        panel: Who rates.
+        rows: The agents that listen, and both references of the same robot and region.
+        plain: The agent without raters on the uncorrupted task, if it was published.
+    """
+
+    robot: str
+    region: str
+    panel: str
+    rows: tuple[Row, ...]
+    plain: Row | None
+
+    @property
+    def name(self) -> str:
+        """Say which it is."""
+        lies = "nothing lies" if self.region == "none" else f"a lie about {self.region}"
+        return f"{self.robot}, {lies}, {self.panel} panel"
+
+    def one(self, mitigation: str) -> Row | None:
+        """Return the row of a mitigation, if it was published."""
+        return next((r for r in self.rows if r["mitigation"] == mitigation), None)
+
+
+def settings(p: Published) -> Iterator[Setting]:
+    """Yield what was published of the study, setting by setting."""
+    rows = p.rows(STUDY)
+    plain = {r["robot"]: r for r in rows if r["region"] == "none" and r["mitigation"] == "raw"}
+    places = dict.fromkeys((r["robot"], r["region"], r["panel"]) for r in rows if r["panel"] != "none")
+    for robot, region, panel in places:
+        here = [r for r in rows if (r["robot"], r["region"]) == (robot, region) and r["panel"] in ("none", panel)]
+        yield Setting(robot, region, panel, tuple(here), plain.get(robot))
+
+
+def section(p: Published) -> list[Section]:
+    """Return the section of the report; nothing where nothing was published."""
+    every = list(settings(p))
+    if not every:
+        return []
+    html = "".join(map(table, [*(_table(p, s) for s in every), *_noise(p)]))
+    missing = _missing(p)
+    note = f"<p>{missing}</p>" if missing else ""
+    return [Section(STUDY, "Robots with raters nobody tuned on", 65, note + html, "Robots", losses=tuple(losses(p)))]
+
+
+def _missing(p: Published) -> str:
+    rows = [r for name in (STUDY, NOISE) for r in p.studies[name].rows]
+    lost = sum(not p.has(r) for r in rows)
+    return f"{lost} of the {len(rows)} rows of these studies are not trained yet; they are not shown." if lost else ""
+
+
+def _rivals(p: Published, s: Setting, metric: str) -> tuple[list[Row], Family]:
+    ours = s.one(OURS)
+    rivals = [r for r in s.rows if ours is not None and r["mitigation"] not in (OURS, *REFERENCES)]
+    return rivals, p.compare([(r, ours) for r in rivals if ours is not None], metric)
+
+
+def _share(p: Published, r: Row, reference: Row | None) -> str:
+    """Return the mean true return as a share of a reference's; of means, which need not be of equal seeds."""
+    if reference is None:
+        return "–"
+    whole = p.of(reference, "true_return").mean
+    return f"{100 * p.of(r, 'true_return').mean / whole:.0f} %" if whole > 0 else "–"
+
+
+def _table(p: Published, s: Setting) -> Table:
+    rows = []
+    for r in s.rows:
+        hacks, true = (p.of(r, metric) for metric in ("hacks", "true_return"))
+        rows.append(
+            (
+                r["mitigation"],
+                f"{number(hacks.mean)}{bounds(hacks.ci95)}",
+                f"{number(true.mean)}{bounds(true.ci95)}",
+                _share(p, r, s.one("true reward")),
+                _share(p, r, s.plain),
+                str(len(p.seeds_of(r))),
+            )
+        )
+    columns = ("learns from", "hacks", "true return", "of true reward", "of uncorrupted task", "seeds")
+    caption = _rivals(p, s, "true_return")[1].caption() if s.one(OURS) else ""
+    note = (
+        "Per episode over the last 100 of 200 000 steps, PPO; means [95 %]. Shares of the mean true return of the agent "
+        f"on the true reward, and of the plain agent where nothing lies. True return of each rival against uard: {caption}"
+    )
+    return Table(s.name, columns, tuple(rows), 1, note)
+
+
+def _noise(p: Published) -> list[Table]:
+    rows = p.rows(NOISE)
+    shares = list(dict.fromkeys(r["noise"] for r in rows))
+    lines = []
+    for name in dict.fromkeys(r["mitigation"] for r in rows):
+        of = {r["noise"]: r for r in rows if r["mitigation"] == name}
+        cells = (
+            f"{number(p.of(of[x], 'true_return').mean)} ({number(p.of(of[x], 'hacks').mean)})" if x in of else "–"
+            for x in shares
+        )
+        lines.append((name, *cells))
+    if not lines:
+        return []
+    columns = ("learns from", *(f"noise {100 * x:g} %" for x in shares))
+    note = "True return (hacks) per episode, means; noise of every rater as a share of the bonus."
+    return [Table("hopper, a lie about crouch, main panel with more noise", columns, tuple(lines), 1, note)]
+
+
+def losses(p: Published) -> list[str]:
+    """Say where a simple rule does as well as ``uard``, where a rival does better, and where hacks are left."""
+    out = []
+    for s in settings(p):
+        ours = s.one(OURS)
+        if ours is None:
+            continue
+        out += _beaten(p, s, ours) + _left(p, s, ours)
+    return out
+
+
+def _beaten(p: Published, s: Setting, ours: Row) -> list[str]:
+    rivals, family = _rivals(p, s, "true_return")
+    own = p.of(ours, "true_return")
+    out = []
+    for i, r in enumerate(rivals):
+        theirs = p.of(r, "true_return")
+        both = f"{number(theirs.mean)}{bounds(theirs.ci95)} against {number(own.mean)}{bounds(own.ci95)}"
+        if family.above(i):
+            out.append(f"Robots, {s.name}: {r['mitigation']} earns more than uard, true return {both}.")
+        elif r["mitigation"] in SIMPLE and not family.below(i) and family.tests[i] is not None:
+            out.append(
+                f"Robots, {s.name}: {r['mitigation']} is not told apart from uard, true return {both}; a difference of "
+                f"{number(family.detectable[i])} would have been found."
+            )
+    return out
+
+
+def _left(p: Published, s: Setting, ours: Row) -> list[str]:
+    """Say where more than a hundredth of the raw agent's hacks are left, and where true return is lost."""
+    out = []
+    raw, honest = s.one("raw"), s.one("true reward")
+    if raw is not None and s.region != "none":
+        left, whole = p.of(ours, "hacks").mean, p.of(raw, "hacks").mean
+        if left > 0.01 * whole:
+            by = "" if honest is None else f"; training on the true reward leaves {number(p.of(honest, 'hacks').mean)}"
+            out.append(f"Robots, {s.name}: {number(left)} of the raw agent's {number(whole)} hacks are left{by}.")
+    reference = honest if s.region != "none" else s.plain
+    if reference is not None:
+        own, theirs = p.of(ours, "true_return"), p.of(reference, "true_return")
+        if own.mean < 0.95 * theirs.mean:
+            who = "the agent on the true reward" if s.region != "none" else "the agent that listens to nobody"
+            out.append(
+                f"Robots, {s.name}: true return {number(own.mean)}{bounds(own.ci95)} is less than 95 % of "
+                f"{number(theirs.mean)}{bounds(theirs.ci95)}, that of {who}."
+            )
+    return out
