@@ -139,7 +139,6 @@ def variance_between(
         here: Who is heard.
         variance: Of each rater's error, > 0.
     """
-    xp = namespace(said)
     return _variance_between(_sums(said, precise_mean(said, here, variance), here, variance))
 
 
