@@ -103,20 +103,24 @@ def pool(
         span: Within how wide a range truths lie, > 0.
     """
     xp = namespace(said)
-    zero = xp.zeros_like(said)
-    tau2 = variance_between(said, here, variance)
-    mean = _mean(said, here, variance + tau2[..., None])
-    anybody = mean.total > 0
-    widened = xp.where(here, xp.log1p(tau2[..., None] / variance) + mean.weight * mean.gap**2, zero)
-    apart = -0.5 * (xp.sum(widened, axis=-1) + xp.log1p(span * span * mean.total))
-    from_reward = xp.where(here, (said - reward[..., None]) ** 2 / variance, zero)
-    nothing = xp.zeros_like(mean.total)
+    sums = _sums(said, reward, here, variance)
+    tau2 = _variance_between(sums)
+    zero = xp.zeros_like(tau2)
+    shrunk = 1.0 + tau2[..., None] * sums.weight
+    weight = sums.weight / shrunk  # 1 / (v + tau^2)
+    total, first = xp.sum(weight, axis=-1), xp.sum(weight * sums.gap, axis=-1)
+    anybody = total > 0
+    precision = xp.where(anybody, total, zero + 1.0)
+    gap = first / precision
+    # Both hypotheses' squares are about the reward: those about the centre are total * gap^2 less.
+    squares = xp.sum((sums.weight - weight) * sums.gap * sums.gap, axis=-1) + first * gap
+    determinants = xp.sum(xp.log(shrunk), axis=-1) + xp.log(1.0 + span * span * total)
     return Pool(
-        heard=xp.sum(xp.astype(here, said.dtype), axis=-1),
-        centre=mean.centre,
+        heard=sums.heard,
+        centre=xp.where(anybody, reward + gap, zero),
         tau=root(tau2),
-        error=xp.where(anybody, 1.0 / xp.sqrt(xp.where(anybody, mean.total, nothing + 1.0)), nothing),
-        log_odds=xp.where(anybody, apart + 0.5 * xp.sum(from_reward, axis=-1), nothing),
+        error=xp.where(anybody, 1.0 / xp.sqrt(precision), zero),
+        log_odds=xp.where(anybody, 0.5 * (squares - determinants), zero),
     )
 
 
@@ -135,13 +139,7 @@ def variance_between(
         here: Who is heard.
         variance: Of each rater's error, > 0.
     """
-    xp, mean = namespace(said), _mean(said, here, variance)
-    zero = xp.zeros_like(mean.total)
-    raters = xp.sum(xp.astype(here, said.dtype), axis=-1)
-    excess = xp.maximum(xp.sum(mean.weight * mean.gap**2, axis=-1) - (raters - 1.0), zero)
-    several = raters > 1.0
-    squares = xp.sum(mean.weight**2, axis=-1) / xp.where(several, mean.total, zero + 1.0)
-    return xp.where(several, excess / xp.where(several, mean.total - squares, zero + 1.0), zero)
+    return _variance_between(_sums(said, precise_mean(said, here, variance), here, variance))
 
 
 def overruled(
@@ -178,7 +176,7 @@ def overruled(
         dissenter = (xp.arange(raters) == lowest[..., None]) & here
         others = here & ~dissenter
         tau2 = variance_between(said, others, variance)
-        distance = _mean(said, others, variance).centre[..., None] - said
+        distance = precise_mean(said, others, variance)[..., None] - said
         alone = distance > OUTLIER * xp.sqrt(variance + tau2[..., None])
         left = xp.sum(xp.astype(others, said.dtype), axis=-1)
         usual = xp.sum(xp.where(others, zero + noise, zero), axis=-1) / xp.maximum(left, xp.ones_like(left))
@@ -203,22 +201,41 @@ def precise_mean(
         here: Who is heard.
         variance: Of each rater's error, > 0.
     """
-    return _mean(said, here, variance).centre
+    xp = namespace(said)
+    sums = _sums(said, xp.zeros_like(said[..., 0]), here, variance)
+    return sums.first / xp.where(sums.heard > 0, sums.total, xp.ones_like(sums.total))
 
 
-class _Mean(NamedTuple):
-    """A precision-weighted mean over the raters who are heard; 0 where nobody is."""
+class _Sums(NamedTuple):
+    """Sums over the raters who are heard of what they say beyond something, weighed by the inverse variances."""
 
+    heard: Float[Array, "*batch"]
     weight: Float[Array, "*batch K"]
-    total: Float[Array, "*batch"]
-    centre: Float[Array, "*batch"]
     gap: Float[Array, "*batch K"]
+    total: Float[Array, "*batch"]
+    first: Float[Array, "*batch"]
+    second: Float[Array, "*batch"]
 
 
-def _mean(said: Float[Array, "*batch K"], here: Bool[Array, "*batch K"], variance: Float[Array, "*batch K"]) -> _Mean:
+def _sums(
+    said: Float[Array, "*batch K"],
+    about: Float[Array, "*batch"],
+    here: Bool[Array, "*batch K"],
+    variance: Float[Array, "*batch K"],
+) -> _Sums:
     xp = namespace(said)
     zero = xp.zeros_like(said)
-    weight, held = xp.where(here, 1.0 / variance, zero), xp.where(here, said, zero)
-    total = xp.sum(weight, axis=-1)
-    centre = xp.sum(weight * held, axis=-1) / xp.where(total > 0, total, xp.ones_like(total))
-    return _Mean(weight, total, centre, held - centre[..., None])
+    weight, gap = xp.where(here, 1.0 / variance, zero), xp.where(here, said - about[..., None], zero)
+    first = weight * gap
+    heard = xp.sum(xp.astype(here, said.dtype), axis=-1)
+    return _Sums(heard, weight, gap, xp.sum(weight, axis=-1), xp.sum(first, axis=-1), xp.sum(first * gap, axis=-1))
+
+
+def _variance_between(s: _Sums) -> Float[Array, "*batch"]:
+    xp = namespace(s.total)
+    zero = xp.zeros_like(s.total)
+    several = s.heard > 1.0
+    total = xp.where(several, s.total, zero + 1.0)
+    excess = xp.maximum(s.second - s.first * s.first / total - (s.heard - 1.0), zero)
+    spread = xp.where(several, total - xp.sum(s.weight * s.weight, axis=-1) / total, zero + 1.0)
+    return xp.where(several, excess / spread, zero)

@@ -133,8 +133,8 @@ def error_of_means(by_rater: ByRater, statistics: RaterStatistics) -> Float[Arra
     """
     xp, n = namespace(by_rater.mean), by_rater.count
     one = xp.ones_like(n)
-    answer = (4.0 * statistics.noise + by_rater.m2) / (4.0 + xp.maximum(n - 1.0, 0.0 * one))
-    return answer / xp.where(n > 0, n, one) + statistics.idiosyncrasy + statistics.floor
+    n = xp.maximum(n, one)
+    return (4.0 * statistics.noise + by_rater.m2) / ((n + 3.0) * n) + statistics.idiosyncrasy + statistics.floor
 
 
 def of_raters(statistics: RaterStatistics, raters: int) -> RaterStatistics:

@@ -113,10 +113,10 @@ class PooledDiscounting(Mitigation):
         if self.vetoes:
             here = pooled.overruled(said, here, variance, raters.noise, self.vetoes)
         p = pooled.pool(r, said, here, variance, raters.span)
-        half = xp.exp(0.5 * xp.clip(p.log_odds, -pooled.LARGEST_ODDS, pooled.LARGEST_ODDS))
-        odds = self.lies / (1.0 - self.lies) * half * half
+        prior = self.lies / (1.0 - self.lies)
+        odds = prior * xp.exp(xp.clip(p.log_odds, -pooled.LARGEST_ODDS, pooled.LARGEST_ODDS))
         w = 1.0 / (1.0 + odds)
-        deviation = (self.lies / (1.0 - self.lies)) ** 0.5 * half * w  # sqrt(w (1 - w)), with a finite gradient
+        deviation = xp.sqrt(odds) * w  # sqrt(w (1 - w)), with a finite gradient
         b = p.centre - self.contest * p.tau - self.caution * p.error
         learned = b + w * (r - b) - self.risk * deviation * abs(r - b)
         u = statistics.usual

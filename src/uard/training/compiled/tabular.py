@@ -26,7 +26,7 @@ from uard.training.tracing import traceable
 
 CHUNK = 512  # steps whose random numbers are drawn together; the panel's statistics are measured once a chunk, or,
 # where a rule asks for them early, whenever the number of steps has doubled: so in the first chunk, at
-DOUBLED = np.isin(np.arange(CHUNK), [0, *(2**i for i in range(CHUNK.bit_length()))])
+DOUBLED = np.array([0, *(2**i for i in range(CHUNK.bit_length()))])  # its end is the last
 ROOM = 64  # a program has room for this many runs, or a multiple
 
 
@@ -258,17 +258,17 @@ def train_one(run: Run, program: Program) -> TrainedTables:
             steps=c.steps + active.astype(jnp.int32),
         ), None
 
-    def refitting_step(c: _Carry, now: tuple[Array, _Draws]) -> tuple[_Carry, None]:
-        fits, draws = now
-        statistics = lax.cond(fits, panel_statistics, lambda rows: c.statistics, c.rows)
-        return one_step(c._replace(statistics=statistics), draws)
+    def fit_and_go(c: _Carry, draws: _Draws, steps: tuple[Array, Array]) -> _Carry:
+        c = c._replace(statistics=panel_statistics(c.rows))
+        return lax.fori_loop(*steps, lambda i, c: one_step(c, jax.tree.map(lambda x: at(x, i), draws))[0], c)
 
     def chunk(loop: tuple[_Carry, Array, Array, Array], refits: bool = False) -> tuple[_Carry, Array, Array, Array]:
         c, number, q_kept, rows_kept = loop
         draws = _drawn(run, number, actions, raters if asks_raters else None)
         slot = c.episode * program.snapshots // program.episodes
         if refits:
-            c, _ = lax.scan(refitting_step, c, (jnp.asarray(DOUBLED), draws))
+            bounds = jnp.asarray(DOUBLED[:-1]), jnp.asarray(DOUBLED[1:])
+            c, _ = lax.scan(lambda c, steps: (fit_and_go(c, draws, steps), None), c, bounds)
         else:
             if doubles:
                 chunks = number - 1
@@ -286,11 +286,12 @@ def train_one(run: Run, program: Program) -> TrainedTables:
 
     q = tabular.init(agent, _key(run.seed, jnp.uint32(0)), states, actions)
     rows = empty_rows((states, actions), raters, jnp, jnp.float32)
+    before = jax.tree.map(jnp.zeros_like, jax.eval_shape(panel_statistics, rows))  # a chunk begins by measuring them
     start = _Carry(
         q=q,
         row=q[starts[0]],
         rows=rows,
-        statistics=panel_statistics(rows),
+        statistics=before if asks_raters else panel_statistics(rows),
         state=starts[0],
         time=jnp.int32(0),
         episode=jnp.int32(0),
