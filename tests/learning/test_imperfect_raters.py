@@ -113,8 +113,8 @@ def test_on_a_simulator_missing_ratings_are_kept_as_missing(which: str):
     )
     done, quiet = (host.run(loop_of(replace(job, panel=panel))) for panel in (PANEL, QUIET))
     ratings = done.state.reservoir.targets[:, :-1]
+    missing = ~done.state.reservoir.answered[:, :-1]
     assert done.state.reservoir.seen[0] > len(ratings) == 64, "the sample is full"
-    missing = np.isnan(ratings)
     assert not missing[:, [HONEST, STARRED, LAPSING]].any()
     assert 0.2 < missing[:, SHY].mean() < 0.8
     assert np.isin(ratings[:, STARRED], LEVELS).all()
@@ -122,4 +122,6 @@ def test_on_a_simulator_missing_ratings_are_kept_as_missing(which: str):
     assert all(np.isfinite(x).all() for layer in done.state.model.layers for x in layer)
     share = quiet.state.reservoir.seen[0] / quiet.state.steps
     assert share == pytest.approx(0.5 * ANSWERED, abs=4.5 * 0.4 / math.sqrt(512))
-    assert not np.isnan(quiet.state.reservoir.targets[:, :-1]).all(-1).any(), "none in which nobody answered"
+    assert quiet.state.reservoir.answered[: quiet.state.reservoir.seen[0]].any(-1).all(), (
+        "none in which nobody answered"
+    )

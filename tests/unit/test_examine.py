@@ -80,6 +80,41 @@ def test_what_a_random_action_would_do_leaves_no_trace_in_the_walk(monkeypatch):
     assert np.isfinite(found["perturbed"]).all()
 
 
+def test_a_kick_changes_nothing_before_it_and_throws_sigma_m_at_its_step(monkeypatch):
+    monkeypatch.setattr(examine, "KICKED_AT", 5)
+    loop, state = trained(ON, named("uard"))
+    none, mild, hard = examine.examine(loop, state)["kicked"]
+    assert none.shape == (examine.KICKED_STEPS, len(examine.KICKED))
+    names = examine.KICKED.index
+    for kicked in (mild, hard):
+        np.testing.assert_array_equal(kicked[:5], none[:5])
+        rewards = [names("observed"), names("true")]
+        np.testing.assert_array_equal(kicked[5, rewards], none[5, rewards])  # the step itself is paid for as it was
+        assert kicked[5, names("sigma_m")] != none[5, names("sigma_m")]  # the state after it is another
+        assert (np.diff(kicked[:, 0]) <= 0).all(), "who has fallen does not stand again"
+    speed = hard[6, names("observed")] - none[6, names("observed")]
+    assert 3 < speed < 6, "5 m/s more are paid for in the next step"
+    assert not hard[hard[:, 0] == 0, 1:].any()
+
+
+def test_a_kicked_raw_agent_asks_nobody_and_believes_all():
+    kicked = examine.examine(*trained(ON, Raw()))["kicked"]
+    columns = dict(zip(examine.KICKED, np.moveaxis(kicked, -1, 0), strict=True))
+    assert not columns["sigma_h"].any()
+    np.testing.assert_array_equal(columns["adjusted"], columns["observed"])
+    np.testing.assert_array_equal(columns["weight"], columns["standing"] > 0)
+
+
+def test_a_training_by_parts_of_its_steps_and_a_walk_by_groups_by_hand():
+    log = np.array([[1.0, 10.0], [3.0, 30.0], [8.0, 80.0], [9.0, 90.0]])
+    parts = derive.learning(log, np.array([2, 9, 195, 203]), 200)  # 10 steps a part; the last is past the end
+    assert parts.shape == (derive.BINS, 2)
+    np.testing.assert_array_equal(parts[[0, 1, 18, 19]], [[2, 20], [2, 20], [2, 20], [8.5, 85]])
+    kicked = np.zeros((1, 10, 2))
+    kicked[0, :5] = [[1.0, 2.0], [1.0, 2.0], [0.5, 8.0], [0.5, 8.0], [0.0, 0.0]]
+    np.testing.assert_allclose(derive.grouped(kicked), [[[0.6, 4.0], [0.0, 0.0]]])  # (2 + 2 + 4 + 4) / 3
+
+
 class RewardFn(SimpleNamespace):
     """What is learned at places 0 to 99 in a world of reward 1 and discount 0.5, with given values and doubts."""
 

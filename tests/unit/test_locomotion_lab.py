@@ -27,12 +27,13 @@ from uard.lab.execution.store import Store
 from uard.lab.execution.training import packed, train_batch
 from uard.lab.result import METRICS
 from uard.lab.studies import every
+from uard.lab.trainers import examine
 from uard.lab.trainers.simulated import checkpoint_of
-from uard.lab.views.published import Published, packaged_json
+from uard.lab.views.published import Published, packaged, packaged_json
 from uard.method.mitigations import Raw, named
 from uard.ratings.panels import PANELS
 from uard.replication import locomotion as shown
-from uard.replication.studies import locomotion
+from uard.replication.studies import derive, locomotion
 from uard.training.feedback.rating_model import RatingModel
 from uard.training.feedback.transition_model import TransitionModel
 
@@ -155,7 +156,7 @@ def test_studies_of_all_sizes_are_the_same_questions():
 
 
 def test_every_study_is_shown_by_a_table_with_a_line_for_each_row():
-    studies = [s for s in locomotion.studies(locomotion.STANDARD) if s.name != shown.DISTORTION]
+    studies = [s for s in locomotion.studies(locomotion.STANDARD) if s.name not in (shown.DISTORTION, shown.DRIFT)]
     seeds = {
         "seeds": [0, 1],
         "metrics": {m: [1.0, 2.0] for m in METRICS},
@@ -188,9 +189,57 @@ def test_shares_of_all_settings_together_by_hand():
     removed, kept = found
     np.testing.assert_allclose(removed, [0.99, 0.99])
     np.testing.assert_allclose(kept, [0.75, 1.25])
+    one = cells[next(r for r in rows if r["mitigation"] == "uard" and r["region"] != "none").cell.key]
+    one |= {"seeds": [7, 1], "metrics": {m: [1e9, x[1]] for m, x in one["metrics"].items()}}
+    found = shown.pooled(Published(every(), [{"format": FORMAT, "cells": cells}]), "hopper", "ppo", "uard")
+    assert found is not None
+    np.testing.assert_allclose(found, [[0.99], [1.25]])  # of the seed that all rows have
     del cells[rows[-1].cell.key]
     assert shown.pooled(Published(every(), [{"format": FORMAT, "cells": cells}]), "hopper", "ppo", "uard-0.1") is None
     assert shown.pooled(p, "walker2d", "ppo", "uard-0.1") is None
+
+
+def kicks(stand):
+    """Three kicks of one seed that stands as given in each group of five steps; the other columns count the groups."""
+    found = np.zeros((3, 30, len(examine.KICKED)))
+    found[..., 0] = stand
+    found[..., 1:] = np.arange(30.0)[:, None]
+    return found
+
+
+def test_what_is_said_around_a_kick_by_hand():
+    (study,) = (s for s in locomotion.studies(locomotion.STANDARD) if s.name == shown.DRIFT)
+    stand = np.ones(30)
+    stand[11:] = 0.5  # half of the copies fall in the first five steps after the kick
+    fallen = np.zeros(30)
+    fallen[:9] = 1.0  # all fall before it
+    walks = [kicks(stand).tolist(), kicks(fallen).tolist()]
+    learning = np.stack([np.full((derive.BINS, 3), x) for x in (1.0, 2.0)]).tolist()
+    metrics = {m: [1.0, 2.0] for m in METRICS}
+    derived = {"deterministic": [[1, 2], [3, 4]]}
+    cell = {"seeds": [0, 1], "metrics": metrics, "derived": derived | {"kicked": walks, "learning": learning}}
+    p = Published(every(), [{"format": FORMAT, "cells": {r.cell.key: cell for r in study.rows}}])
+    found = shown.around_kick(p, study.rows[0])
+    assert found[5.0, "kick"]["standing"].tolist() == [0.75], "the seed that fell before is left out"
+    assert found[5.0, "later"]["standing"].tolist() == [0.5]
+    assert found[5.0, "before"]["sigma_m"].tolist() == [7.0]  # groups 5 to 9
+    np.testing.assert_allclose(found[5.0, "kick"]["sigma_m"], [(10 + 0.5 * 11) / 1.5])
+    (table,) = (t for t in shown.tables(p) if "with a kick" in t.title)
+    assert len(table.rows) == 7 * len(study.rows)
+    titles = [title for title, _, _ in shown.drawn(p)]
+    assert [t.split(" ")[0] for t in titles] == ["G6,", "G6,", "G6", "G7", "G10", "G10"]
+    bare = {r.cell.key: cell | {"derived": derived} for r in study.rows}
+    other = Published(every(), [{"format": FORMAT, "cells": bare}])
+    assert shown.drifting(other) == [], "published for another study, without what this one derives"
+
+
+def test_losses_are_short_lines_that_name_what_they_cost():
+    lines = shown.losses(packaged())
+    assert lines
+    for line in lines:
+        assert line.startswith("MuJoCo, ")
+        assert len(line) < 300
+        assert any(c.isdigit() for c in line) or "no proof" in line
 
 
 def test_other_agents_are_summed_up_by_their_worse_robot():

@@ -61,8 +61,8 @@ ON = {"envs": 4, "rollout": 32, "epochs": 1, "minibatches": 2, "count_bonus": 0.
 SOFT = {"network": Network(16, 1e-3, 1.0), "batch": 32, "warmup": 128}
 TANH = Network(16, 1e-3, 100.0, "tanh")
 SHORT, LONG = {"episodes": 20}, {"episodes": 40}
-MODEL = {"rating_model": RatingModel(2, 8, fits=2, batch=16)} | SHORT
-TRANSITIONS = {"rating_model": TransitionModel(2, 8, fits=4, batch=32, capacity=256)}
+MODEL = {"rating_model": RatingModel(2, 8, fits=2, batch=16, predicts="ratings")} | SHORT
+TRANSITIONS = {"rating_model": TransitionModel(2, 8, fits=4, batch=32, capacity=256, predicts="ratings")}
 APPENDIX, COLLUDING, SINGLE = (PANELS[name] for name in ("appendix", "colluding", "single"))
 LEARNED = LearnedRewardGrid(size=6, unrated=2, horizon=20)
 HOPPERS = {

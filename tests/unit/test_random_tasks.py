@@ -53,11 +53,3 @@ def test_the_oracle_learns_what_raw_cannot():
 def test_the_oracle_is_refused_where_no_trainer_can_tell_it_the_truth():
     with pytest.raises(InvalidValueError, match="mitigation"):
         Cell(TrapGrid(), named("true-reward"), registry.AGENTS["dqn"])
-
-
-@pytest.mark.parametrize("name", ["uard", "excess", "median", "min-proxy-mean"])
-def test_rules_that_ask_who_said_what_need_tables(name):
-    model = registry.rating_model("model", registry.AGENTS["dqn"], TrapGrid())
-    with pytest.raises(InvalidValueError, match=r"^mitigation = .*which rater said what"):
-        Cell(TrapGrid(), named(name), registry.AGENTS["dqn"], rating_model=model)
-    assert Cell(TrapGrid(), named(name), registry.AGENTS["dqn"]).rating_model is None

@@ -108,8 +108,9 @@ def fitted() -> Any:
                 SPEC, model, known, world.observe, ACTIONS, jax.random.fold_in(jax.random.key(1), i)
             )
 
-        model = rating_model.init(SPEC, jax.random.key(0), STATES, ACTIONS)
+        model = rating_model.init(SPEC, jax.random.key(0), STATES, ACTIONS, RATERS)
         model = jax.lax.fori_loop(0, chunks, once, model)
+        model = rating_model.with_noise(SPEC, model, known, world.observe, ACTIONS)
         return model, rating_model.read(SPEC, model, jnp.eye(STATES), ACTIONS, RATERS)
 
     return jax.jit(fit)
@@ -139,7 +140,9 @@ def test_predictions_approach_what_the_panel_says():
     assert late.sd[hack].min() > 0.5 > 0.2 > np.quantile(late.sd[~hack], 0.95)
     assert (late.sd >= 0).all()
     np.testing.assert_array_equal(late.raters, np.full((STATES, ACTIONS), RATERS))
-    assert late.by_rater is None, "a prediction is of the panel, not of its members"
+    each = late.by_rater
+    assert error(each.mean, centre) < 0.15 * float(np.std(WORLD.task.reward))
+    assert (each.count > 0).all()
 
 
 def test_count_is_high_where_there_were_ratings():
@@ -149,6 +152,26 @@ def test_count_is_high_where_there_were_ratings():
     assert (yes[:, None] > no[None, :]).mean() > 0.99
     assert np.median(no) < 0.5 < 5 < np.median(yes)
     assert (count >= 0).all()
+
+
+def test_gaps_are_added_to_the_reward_that_was_observed():
+    _, feedback = read_after(200)
+    reward = np.full((STATES, ACTIONS), 7.0)
+    seen = rating_model.observing(feedback, reward)
+    np.testing.assert_array_equal(seen.proxy, reward)
+    gaps = feedback.by_rater.mean - feedback.proxy[..., None]
+    np.testing.assert_allclose(seen.by_rater.mean, 7.0 + gaps, atol=1e-5)
+    np.testing.assert_allclose(seen.mean - seen.lowest, feedback.mean - feedback.lowest, atol=1e-5)
+
+
+def test_a_rater_who_never_answered_is_not_heard():
+    known = rated_world(np.ones(len(HALF), bool))
+    rows = np.array(known.rows)
+    rows[:, 5:][:, [0, RATERS, 2 * RATERS]] = 0.0  # of the first: count, mean, squares
+    model, feedback = jax.tree.map(np.asarray, fitted()(WORLD, known._replace(rows=jnp.asarray(rows)), 5))
+    assert model.noise[0] == -1.0 < 0.0 <= model.noise[1:].min()
+    assert not feedback.by_rater.count[..., 0].any()
+    assert (feedback.by_rater.count[..., 1:] > 0).all()
 
 
 def test_before_the_first_rating_nothing_is_fitted():

@@ -21,6 +21,7 @@ OWN = {
     "reproduce": "reproduce.Reproduce",
     "doctor": "doctor.Doctor",
     "preferences": "preferences.Preferences",
+    "raters": "raters.Raters",
     "best-of-n": "best_of_n.BestOfN",
     "leaderboard": "leaderboard.Leaderboard",
     "status": "status.Status",

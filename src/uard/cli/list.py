@@ -37,7 +37,8 @@ class List:
             | {f"{RANDOM}SEED": "one to seven raters drawn at random, the same for the same seed"},
             **{
                 f"studies of {group}": {
-                    s.name: f"{s.title} ({s.answers}; {counted(len(s.rows), 'cell')})" for s in members
+                    s.name: f"{s.title} ({s.answers}; {counted(len(s.rows), 'cell')}{'; to tune on' * s.development})"
+                    for s in members
                 }
                 for group, members in studies.groups().items()
             },

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from uard.lab.execution.store import Store
     from uard.lab.study import Study
+    from uard.lab.views.panels import PerSeed
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Reproduce:
     """Run studies, all grid studies if none is named, and write the report. Finished cells are never run again."""
 
     studies: Positional[tuple[str, ...]] = ()
-    """Which studies or groups of them (see `uard list`): grid if left out, games, grid-deep."""
+    """Which studies or groups of them (see `uard list`): grid if left out, games, panels, grid-deep."""
     mitigation: Names = ()
     """Let this one, your own perhaps, join every study that compares mitigations. Repeatable."""
     seeds: int = 10
@@ -38,9 +39,11 @@ class Reproduce:
     first_seed: int = 0
     """The first of them; the others follow it."""
     report: str | None = None
-    """Write the report into this folder; only possible for the whole grid."""
+    """Write the report into this folder; only possible for the whole grid, or of panels alone."""
     extract: str | None = None
     """Write what the report needs of these studies to this small JSON file (- for standard output)."""
+    published: str | None = None
+    """Train nothing, but read what --extract wrote of panels."""
     store: str = DEFAULT_STORE
     """Where finished seeds are kept."""
     workers: int | None = None
@@ -69,6 +72,9 @@ class Reproduce:
             terminal.warning(console, text)
         chosen = studies.find(self.studies, self.mitigation)
         self._check_outputs(chosen)
+        if self.published is not None:
+            self._show_published(chosen[0], console)
+            return
         store, seeds = Store(self.store), self._seeds
         self._train(chosen, store, console, engine)
         if self.failed:
@@ -78,7 +84,12 @@ class Reproduce:
 
             line = f"uard reproduce {' '.join(self.studies)} {self._said_of_seeds}"
             terminal.write_json(published.extract(chosen, store, seeds, line), self.extract, "extract", indent=None)
-        if self.report is not None:
+        if len(chosen) == 1 and chosen[0].brief:
+            from uard.lab.views.study_results import StudyResults
+
+            results = StudyResults(store, seeds, chosen)
+            self._show_panels(chosen[0], lambda r, metric: results.values(r.cell, metric), self.seeds, console)
+        elif self.report is not None:
             from uard.lab.views import page
 
             with progress.spinner(console, "writing the report"):
@@ -94,6 +105,27 @@ class Reproduce:
             results = StudyResults(store, seeds, chosen)
             for study in chosen:
                 terminal.show(study_table(study, results))
+
+    def _show_published(self, study: Study, console: Console) -> None:
+        from uard.lab.views.published import Published, read_file
+
+        results = Published([study], [read_file(str(self.published))])
+        if missing := len(study.rows) - len(results.rows(study.name)):
+            allowed = f"a file with all rows of {study.name}: {missing} of {len(study.rows)} are not in it"
+            raise InvalidValueError("published", self.published, allowed)
+        self._show_panels(study, results.per_seed, results.seeds(study.name), console)
+
+    def _show_panels(self, study: Study, per_seed: PerSeed, seeds: int, console: Console) -> None:
+        """Print the regrets of a study of random panels, or write a page of them."""
+        from uard.lab.views import page, panels
+
+        found = panels.regrets(study, per_seed)
+        if self.report is None:
+            for table in panels.tables(found):
+                terminal.show(table)
+            return
+        written = page.write_page(Path(self.report), [panels.section(study, found, seeds)], seeds)
+        terminal.say(console, f"report: {written}")
 
     @property
     def _seeds(self) -> range:
@@ -120,8 +152,14 @@ class Reproduce:
         """Refuse before training, not after it, what cannot be written."""
         from uard.lab import studies
 
-        if self.report is not None and {s.name for s in chosen} < {s.name for s in studies.grid()}:
-            raise InvalidValueError("report", self.report, "left out unless all grid studies are run")
+        alone = len(chosen) == 1 and bool(chosen[0].brief)
+        whole = {s.name for s in studies.grid()} <= {s.name for s in chosen}
+        if self.report is not None and not (alone or whole):
+            raise InvalidValueError("report", self.report, "left out unless all grid studies are run, or panels alone")
+        if self.published is not None and not alone:
+            raise InvalidValueError("published", self.published, "left out unless panels alone are shown")
+        if self.published is not None and self.extract is not None:
+            raise InvalidValueError("extract", self.extract, "left out with --published, which trains nothing")
         if self.report is not None:
             files.prepare_folder(self.report, "report")
         terminal.check_json(self.extract, self.store, field="extract")

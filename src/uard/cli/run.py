@@ -39,7 +39,7 @@ class Run:
     set_mitigation: Pairs = ()
     """Change a field of the mitigation, e.g. lam=5 or kappa=0. Repeatable."""
     panel: str = "main"
-    """Who rates."""
+    """Who rates: a name, random:SEED, or random:SEED:SCALE for rewards of another size than a grid's."""
     noise: float = 0.0
     """Standard deviation of extra noise on every rater, in reward units."""
     noise_fraction: float | None = None
@@ -70,10 +70,13 @@ class Run:
         from uard.lab.execution.store import Store
         from uard.lab.result import summaries
         from uard.lab.study import results_of
+        from uard.ratings.panels import RANDOM, as_panel, composition
 
         _checks.whole("seeds", self.seeds, low=1, high=100_000)
         terminal.check_json(self.json, self.store)
         cell, trap_reward = self._cell()
+        if self.panel.startswith(RANDOM):
+            terminal.say(console, f"{self.panel}: {composition(as_panel(self.panel))}")
         store = Store(":memory:" if self.store is None else self.store)
         seeds = range(self.seeds)
         started = time.perf_counter()
@@ -139,8 +142,8 @@ class Run:
             (
                 name.replace("_", " "),
                 f"{s.mean:.3f}",
-                f"{s.sd:.3f}",
-                f"{s.ci95[0]:.3f} .. {s.ci95[1]:.3f}",
+                f"{s.sd:.3f}" if s.ci95 else "–",
+                f"{s.ci95[0]:.3f} .. {s.ci95[1]:.3f}" if s.ci95 else "one run",
                 f"{s.iqm:.3f}",
             )
             for name, s in metrics.items()

@@ -8,6 +8,7 @@ import numpy as np
 
 from uard.diagnosis.case import FEW, PRINTED, Case, mostly, share_kept
 from uard.diagnosis.finding import Finding, Severity, Stratum, listed, percent, row_count
+from uard.ratings.pairs import line_between, units_of
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Integer
@@ -99,39 +100,9 @@ def _other_units(case: Case, far: Bool[np.ndarray, " n"]) -> Finding:
     )
 
 
-APART = 3.0  # times the scale of another rater: another unit
-SHIFTED = 1.75  # standard deviations of both between their means: another unit
-TELLING = 3.0  # standard errors of a correlation that two raters rate the same thing
-
-
 def units(case: Case) -> Integer[np.ndarray, " m"] | None:
-    """Return the number of each rater's unit, 0..U-1, -1 where it is not known; None if there is but one.
-
-    Two raters who rate the same thing (their correlation on the rows that both rated is over three standard errors
-    above 0) are in different units if their scales differ by a factor of over 3, or their means by over 1.75 standard
-    deviations. How much noise each has is not known; but the slope of a regression of the wider on the narrower is
-    no larger than the ratio of their scales, whatever the noise (Frisch 1934), so noise alone makes no unit.
-    """
-    both = case.pairs_of_raters
-    known = (both.rows >= 10) & (both.correlation * np.sqrt(both.rows) > TELLING)
-    np.fill_diagonal(known, False)
-    narrow, wide = np.minimum(both.sd, both.sd.T), np.maximum(both.sd, both.sd.T)
-    known &= narrow > 0
-    slope = both.correlation * wide / np.where(known, narrow, 1.0)
-    shift = np.abs(both.mean - both.mean.T) / np.where(known, np.hypot(narrow, wide) / np.sqrt(2.0), 1.0)
-    apart = known & ((slope > APART) | (shift > SHIFTED))
-    if not apart.any():
-        return None
-    unit = np.full(len(apart), -1)
-    left = known.any(1)
-    number = 0
-    while left.any():  # connected parts of the graph of raters whom nothing sets apart
-        part = np.zeros_like(left)
-        part[int(np.argmax(left))] = True
-        while (more := left & ~part & (~apart[part]).any(0)).any():
-            part |= more
-        unit[part], left, number = number, left & ~part, number + 1
-    return unit if number > 1 else None
+    """Return the number of each rater's unit, see ``uard.ratings.pairs.units_of``."""
+    return units_of(case.pairs_of_raters)
 
 
 def mixed_units(case: Case) -> Finding | None:
@@ -152,11 +123,10 @@ def mixed_units(case: Case) -> Finding | None:
     for number, group in enumerate(groups):
         parts.append(listed(f"{names[k]} (median {of[k][0]:.3g}, spread {of[k][1]:.3g})" for k in group))
         for k in group if number else ():
-            to = groups[0][(both.rows[k, groups[0]] >= 10) & (both.sd[k, groups[0]] > 0)]
-            if not to.size:
+            line = line_between(both, int(k), groups[0])
+            if line is None:
                 continue
-            slope = float((both.sd[to, k] / both.sd[k, to]).mean())
-            offset = float((both.mean[to, k] - slope * both.mean[k, to]).mean())
+            slope, offset = line
             numbers |= {f"slope_{names[k]}": slope, f"offset_{names[k]}": offset}
             maps.append(f"{slope:.3g} {names[k]} {offset:+.3g}")
     return Finding(

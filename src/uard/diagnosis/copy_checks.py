@@ -8,10 +8,10 @@ import numpy as np
 
 from uard.diagnosis.case import FEW, ROUNDING, Case
 from uard.diagnosis.finding import Finding, listed, percent
-from uard.ratings.pairs import residuals, shared
+from uard.ratings.pairs import equal_share, residuals, shared
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    pass
 
 COMPARISONS = 500_000_000  # of two numbers each, when all pairs of raters are compared for equality
 MOST_PAIRS = 20  # that are named as copies
@@ -31,12 +31,12 @@ def idle_raters(case: Case) -> Finding | None:
         if constant and (case.log.reward is None or np.ptp(reward[here]) > 0):
             idle.append(f"{name} rates every row {column[here][0]:g}")
             numbers[f"constant_{name}"] = float(column[here][0])
-        elif (share := _equal(column, reward, case.unit)) >= 0.99:
+        elif (share := equal_share(column, reward, ROUNDING * case.unit)) >= 0.99:
             idle.append(f"{name} repeats the reward exactly in {percent(share)} of its rows")
             numbers[f"repeats_reward_{name}"] = share
         else:
             for j in alike[k]:
-                if (share := _equal(column, ratings[:, j], case.unit)) >= 0.99:
+                if (share := equal_share(column, ratings[:, j], ROUNDING * case.unit)) >= 0.99:
                     idle.append(f"{name} equals {names[j]} in {percent(share)} of their rows")
                     numbers[f"{name}_repeats_{names[j]}"] = share
                     break
@@ -51,13 +51,6 @@ def idle_raters(case: Case) -> Finding | None:
         "Leave these columns out (--ratings), and find out whether the people rated alone or saw the reward.",
         numbers,
     )
-
-
-def _equal(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], unit: float) -> float:
-    """Return in which share of the rows that have both they are equal; 0 if these are few, or b is constant there."""
-    both = np.isfinite(a) & np.isfinite(b)
-    a, b = a[both], b[both]
-    return float((np.abs(a - b) <= ROUNDING * unit).mean()) if a.size >= FEW and np.ptp(b) > 0 else 0.0
 
 
 def _look_alike(case: Case) -> list[list[int]]:
@@ -123,7 +116,7 @@ def copied_ratings(case: Case) -> Finding | None:
             or (own - others < z * np.hypot(error[i, j], error[[i, j]])).any()
         ):
             continue
-        if _equal(sample.ratings[:, i], sample.ratings[:, j], case.unit) >= 0.99:
+        if equal_share(sample.ratings[:, i], sample.ratings[:, j], ROUNDING * case.unit) >= 0.99:
             continue  # named by idle_raters
         a, b = sample.names[int(i)], sample.names[int(j)]
         numbers[f"correlation_{a}_{b}"] = float(both.correlation[i, j])

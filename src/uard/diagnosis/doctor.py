@@ -83,7 +83,9 @@ def doctor(
         raise _checks.InvalidValueError("by", by, "left out: the log has its own, RatingLog(by=...)")
     name = mitigation if isinstance(mitigation, str) else "your filter"
     case = case_of(log, name, as_filter(mitigation))
-    agreement, strata = krippendorff_alpha(case.ratings), strata_of(case)
+    of_row = None if log.item is None else log.item[case.rows]
+    agreement = krippendorff_alpha(case.ratings)
+    strata = strata_of(None if log.by is None else log.by[case.rows], case.ratings, of_row)
     found = [log_checks.not_finite(log), *(check(case) for check in (RATER_CHECKS if log.reward is None else CHECKS))]
     found.append(agreement_checks.uneven_agreement(strata, agreement))
     return Diagnosis(
@@ -93,7 +95,7 @@ def doctor(
         raters=log.raters,
         rated=float(case.rated.mean()),
         agreement=agreement,
-        agreement_interval=alpha_interval(case.ratings, None if log.item is None else log.item[case.rows]),
+        agreement_interval=alpha_interval(case.ratings, of_row),
         strata=strata,
         independence=_independence(case),
         calibration=truth_checks.calibration_of(case),

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uard.diagnosis.agreement_checks import TELLING, units
+from uard.diagnosis.agreement_checks import units
 from uard.diagnosis.case import FEW, Case
 from uard.diagnosis.finding import Finding, listed
+from uard.ratings.pairs import TELLING
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Integer

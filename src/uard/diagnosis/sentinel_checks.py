@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from uard.diagnosis.agreement_checks import TELLING
 from uard.diagnosis.case import Case
 from uard.diagnosis.finding import Finding, listed, row_count
 from uard.ratings.agreement import krippendorff_alpha
+from uard.ratings.pairs import TELLING
 
 if TYPE_CHECKING:
     from jaxtyping import Float

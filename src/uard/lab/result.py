@@ -29,6 +29,7 @@ METRICS = (
 )
 
 
+SHARES = ("success_rate",)  # metrics that are shares of a seed's episodes
 COLUMNS = (*LOG, "alignment_gap")  # that ``Result.curve`` knows
 _FORMERLY = {"trap_visits": "hacks", "goal": "success", "goal_rate": "success_rate"}
 
@@ -184,12 +185,12 @@ def summaries(results: list[Result]) -> dict[str, statistics.Summary]:
     """Summarise every metric over seeds.
 
     Examples:
-        >>> seeds = [Result(np.full((1, 6), x), steps=1, path=np.array([0]), extra={}) for x in (1.0, 3.0)]
+        >>> seeds = [Result(np.full((1, 6), x), steps=1, path=np.array([0]), extra={}) for x in (0.5, 1.0)]
         >>> summaries(seeds)["hacks"].per_seed
-        (1.0, 3.0)
+        (0.5, 1.0)
 
     Raises:
         InvalidValueError: no results, or a metric that is not finite.
     """
     rows = [r.metrics() for r in results]
-    return {name: statistics.summarise([row[name] for row in rows], name) for name in METRICS}
+    return {name: statistics.summarise([row[name] for row in rows], name, name in SHARES) for name in METRICS}

@@ -11,14 +11,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, final
 
 from uard import _checks
 from uard.lab.cell import Cell
 from uard.lab.execution.store import MissingSeedsError, Store
-from uard.lab.result import COLUMNS, Result, check_name
+from uard.lab.result import COLUMNS, METRICS, Result, check_name
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,45 @@ def row(cell: Cell, **labels: Any) -> Row:
     return Row(tuple(labels.items()), cell)
 
 
+@final
+class LazyRows(Sequence[Row]):
+    """Rows that are built when the first of them is read: thousands take seconds, and most commands need none.
+
+    Examples:
+        >>> rows = LazyRows(lambda: (row(Cell(), agent="q-learning"),), count=1)
+        >>> len(rows), rows[0]["agent"]
+        (1, 'q-learning')
+    """
+
+    def __init__(self, build: Callable[[], tuple[Row, ...]], count: int):
+        """Remember how.
+
+        Args:
+            build: Builds them; called once at most.
+            count: How many it builds.
+        """
+        self._build, self._count = build, count
+
+    @cached_property
+    def _rows(self) -> tuple[Row, ...]:
+        rows = self._build()
+        if len(rows) != self._count:
+            raise _checks.InvalidValueError("count", self._count, f"{len(rows)}: so many are built")
+        return rows
+
+    def __len__(self) -> int:
+        """Return how many there are, without building them."""
+        return self._count
+
+    def __getitem__(self, index: Any) -> Any:
+        """Return a row, or several."""
+        return self._rows[index]
+
+    def __iter__(self) -> Iterator[Row]:
+        """Yield all."""
+        return iter(self._rows)
+
+
 @dataclass(frozen=True)
 class Study:
     """An experiment: a question, what of the paper it answers, and its rows.
@@ -68,27 +108,37 @@ class Study:
         name: As on the command line.
         title: One line.
         answers: Inventory numbers (F2, H5, G3 ...).
-        rows: Its cells with their labels.
+        rows: Its cells with their labels; a tuple, or ``LazyRows`` of a large study.
         curves: Columns of the episode log that are published, binned, beside the metrics.
         derive: What else is published of a cell: numbers by name, of the cell and its results by seed. For what needs
             the whole result, which is too large to be published.
+        brief: Metrics that are published, and nothing else, of a study with thousands of cells; all if left out.
+        development: Whether constants may be tuned on it; what is reported comes from other studies then.
     """
 
     name: str
     title: str
     answers: str
-    rows: tuple[Row, ...]
+    rows: Sequence[Row]
     curves: tuple[str, ...] = ()
     derive: Callable[[Cell, Mapping[int, Result]], dict[str, Any]] | None = None
+    brief: tuple[str, ...] = ()
+    development: bool = False
 
     def __post_init__(self) -> None:
-        """Check the curves.
+        """Check what is published.
 
         Raises:
-            UnknownNameError: a curve that is no column of the episode log.
+            UnknownNameError: a curve that is no column of the episode log, or no metric in ``brief``.
+            InvalidValueError: curves or derived numbers of a study that is published in brief.
         """
-        for i, name in enumerate(self.curves):
-            check_name(f"curves[{i}]", name, COLUMNS)
+        for name, known in (("curves", COLUMNS), ("brief", METRICS)):
+            for i, value in enumerate(getattr(self, name)):
+                check_name(f"{name}[{i}]", value, known)
+        if self.brief and (self.curves or self.derive):
+            raise _checks.InvalidValueError(
+                "brief", self.brief, "left out where curves or what is derived is published"
+            )
 
     def jobs(self, seeds: Iterable[int]) -> list[tuple[Cell, int]]:
         """Return every (cell, seed), the seeds of a cell side by side so that it finishes as a whole."""

@@ -43,6 +43,60 @@ def where(condition: Array, yes: Numbers, no: Numbers) -> Array:
     return namespace(condition, yes, no).where(condition, yes, no)
 
 
+def smallest(values: Array, index: Array, axis: int) -> Array:
+    """Return the smallest values along an axis: the first at index 0, and so on.
+
+    It sorts, but not in JAX: inside a loop on a CPU XLA sorts three numbers in 1 us and 400 in 30 us.
+
+    Examples:
+        >>> smallest(np.array([5.0, 3.0, 4.0]), np.array([0, 2]), axis=0).tolist()
+        [3.0, 5.0]
+
+    Args:
+        values: Of any shape; no NaN.
+        index: Whole numbers from 0 to less than the axis is long, of the values' shape but for that axis.
+        axis: Along which.
+    """
+    xp = namespace(values)
+    if "jax" not in xp.__name__:
+        return xp.take_along_axis(xp.sort(values, axis=axis), index, axis=axis)
+    values, index = xp.moveaxis(values, axis, -1), xp.moveaxis(index, axis, -1)
+    found = _by_rank(values, index) if values.shape[-1] <= FEW else _by_bisection(values, index)
+    return xp.moveaxis(found, -1, axis)
+
+
+FEW = 128  # values of which each is compared with each
+
+
+def _by_rank(values: Array, index: Array) -> Array:
+    """Compare each with each; of equal ones the first is the smaller."""
+    xp, order = namespace(values), np.arange(values.shape[-1])
+    one, other = values[..., :, None], values[..., None, :]
+    rank = xp.sum(xp.astype((other < one) | ((other == one) & (order < order[:, None])), xp.int32), axis=-1)
+    return xp.sum(xp.where(rank[..., None, :] == index[..., None], values[..., None, :], 0.0), axis=-1)
+
+
+def _by_bisection(values: Array, index: Array) -> Array:
+    """Halve the range of the floats' bits, in which they are ordered, until one float is left."""
+    from jax import lax
+
+    xp = namespace(values)
+    kind = xp.int64 if values.dtype.itemsize == 8 else xp.int32
+    limits = xp.iinfo(kind)
+    bits = lax.bitcast_convert_type(lax.stop_gradient(values), kind)
+    bits = xp.where(bits < 0, bits ^ limits.max, bits)[..., None, :]
+
+    def halve(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = (low & high) + ((low ^ high) >> 1)
+        below = xp.sum(xp.astype(bits <= middle[..., None], xp.int32), axis=-1) > index
+        return xp.where(below, low, middle + 1), xp.where(below, middle, high)
+
+    ends = xp.full(index.shape, limits.min, kind), xp.full(index.shape, limits.max, kind)
+    low, _ = lax.fori_loop(0, limits.bits, halve, ends)
+    return xp.min(xp.where(bits == low[..., None], values[..., None, :], xp.inf), axis=-1)
+
+
 def as_floats(field: str, array: Array) -> Array:
     """Return an array of floats, of at least single precision; whole numbers (stars) and truth values become floats.
 

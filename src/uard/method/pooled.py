@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from uard.method.arrays import Array, Numbers, namespace
 from uard.method.feedback import ByRater
-from uard.method.rater_statistics import RaterStatistics
+from uard.method.rater_statistics import RaterStatistics, error_of_means
 from uard.method.uncertainty import root
 
 if TYPE_CHECKING:
@@ -55,10 +55,10 @@ class Pool(NamedTuple):
 def errors(
     reward: Float[Array, "*batch"], by_rater: ByRater, statistics: RaterStatistics, slack: Numbers
 ) -> Float[Array, "*batch K"]:
-    """Return the variance v_k of each rater's mean about what the rater means, in squared reward units.
+    """Return the variance v_k of each rater's mean about a reward that tells the truth, in squared reward units.
 
-    The variance of one answer is the rater's own over all state-actions, corrected by what was seen here; to the error
-    of the mean come the rater's idiosyncrasy and a slack that grows with how unusual the reward is.
+    It is that about what the rater means (``rater_statistics.error_of_means``), another floor, for the reward's mean is
+    no more exact, and a slack that grows with how unusual the reward is.
 
     Examples:
         >>> import numpy as np
@@ -75,11 +75,8 @@ def errors(
         statistics: Of the panel.
         slack: By which share of an unusual reward a rater may be off without a reason, >= 0.
     """
-    xp, n = namespace(by_rater.mean), by_rater.count
-    one = xp.ones_like(n)
-    answer = (4.0 * statistics.noise + by_rater.m2) / (4.0 + xp.maximum(n - 1.0, 0.0 * one))
     off = slack * (reward - statistics.typical)
-    return answer / xp.where(n > 0, n, one) + statistics.idiosyncrasy + 2.0 * statistics.floor + (off * off)[..., None]
+    return error_of_means(by_rater, statistics) + statistics.floor + (off * off)[..., None]
 
 
 def pool(

@@ -7,20 +7,22 @@ of NumPy, JAX or torch arrays.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from uard.method.arrays import Array, Numbers, namespace
+from uard.method.arrays import Array, Numbers, namespace, smallest
 from uard.method.feedback import ByRater
-from uard.method.uncertainty import masked_mean
+from uard.method.uncertainty import masked_mean, root
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
+EQUAL = 1e-5  # of their mean: rewards that deviate by less are all the same
 FLOOR = 0.01  # of the reward's scale: no rater is more exact
 MOST = 4096  # state-actions over which statistics are taken; of more, these are evenly spread
 CHI2_MEDIAN = 0.455  # of one degree of freedom
 ROUNDS = 5  # of Huber's iteration
 SOME = 0.1  # of the state-actions, at which a rater must be near the reward for a bias to be looked for there
+DRAWN = 4.0  # state-actions' worth of no bias that a bias is drawn towards
 LOUDEST = 2.0  # times the median deviation: who is noisier is not heard, among three raters or more
 
 
@@ -67,14 +69,13 @@ def fit(reward: Float[Array, " n"], by_rater: ByRater, rated: Bool[Array, " n"])
         rated: Which of them anybody has rated.
     """
     xp = namespace(by_rater.mean)
-    every = -(-reward.shape[0] // MOST)
-    if every > 1:
-        reward, rated, by_rater = reward[::every], rated[::every], ByRater._make(x[::every] for x in by_rater)
+    reward, by_rater, rated = thinned(reward, by_rater, rated)
     here = (by_rater.count > 0) & rated[:, None]
     count, said = xp.where(here, by_rater.count, xp.zeros_like(by_rater.count)), by_rater.mean
     centre = masked_mean(reward, rated)
-    deviation = xp.sqrt(masked_mean((reward - centre) ** 2, rated))
-    scale = xp.where(deviation > 0, deviation, xp.ones_like(deviation))
+    deviation = root(masked_mean((reward - centre) ** 2, rated))
+    # Equal rewards differ by what rounding makes of their running means; that is no scale.
+    scale = xp.where(deviation > EQUAL * abs(centre), deviation, xp.ones_like(deviation))
     floor = (FLOOR * scale) ** 2
     noise = answer_variance(count, by_rater.m2, scale)
     bias = robust_bias(count, said - reward[:, None], noise, scale)
@@ -91,6 +92,49 @@ def fit(reward: Float[Array, " n"], by_rater: ByRater, rated: Bool[Array, " n"])
     return RaterStatistics(
         noise, bias, idiosyncrasy, xp.astype(quiet, sd.dtype), floor, masked_median(reward, rated), span, scale
     )
+
+
+def thinned(
+    reward: Float[Array, " n"], by_rater: ByRater, rated: Bool[Array, " n"]
+) -> tuple[Float[Array, " m"], ByRater, Bool[Array, " m"]]:
+    """Return at most ``MOST`` of the state-actions, evenly spread.
+
+    Examples:
+        >>> import numpy as np
+        >>> table = ByRater(*np.zeros((3, 10_000, 2)))
+        >>> thinned(np.zeros(10_000), table, np.ones(10_000, bool))[0].shape
+        (3334,)
+
+    Args:
+        reward: Mean observed reward of each distinct state-action.
+        by_rater: What each rater has said of it, (n, K) arrays.
+        rated: Which of them anybody has rated.
+    """
+    every = max(1, -(-reward.shape[0] // MOST))
+    return reward[::every], ByRater._make(x[::every] for x in by_rater), rated[::every]
+
+
+def error_of_means(by_rater: ByRater, statistics: RaterStatistics) -> Float[Array, "*batch K"]:
+    """Return the variance of each rater's mean about what is meant, in squared reward units.
+
+    The variance of one answer is the rater's own over all state-actions, corrected by what was seen here; to the error
+    of the mean come the rater's idiosyncrasy and the floor.
+
+    Examples:
+        >>> import numpy as np
+        >>> reward = np.array([0.0, 0.0, 10.0])
+        >>> twice = ByRater(np.full((3, 1), 2.0), reward[:, None], np.full((3, 1), 0.5))
+        >>> error_of_means(twice, fit(reward, twice, np.ones(3, bool))).round(2).tolist()
+        [[0.24], [0.24], [0.24]]
+
+    Args:
+        by_rater: What each rater has said here; where nothing was said the variance is that of one answer.
+        statistics: Of the panel.
+    """
+    xp, n = namespace(by_rater.mean), by_rater.count
+    one = xp.ones_like(n)
+    answer = (4.0 * statistics.noise + by_rater.m2) / (4.0 + xp.maximum(n - 1.0, 0.0 * one))
+    return answer / xp.where(n > 0, n, one) + statistics.idiosyncrasy + statistics.floor
 
 
 def of_raters(statistics: RaterStatistics, raters: int) -> RaterStatistics:
@@ -172,7 +216,7 @@ def robust_bias(
         total = xp.sum(weight, axis=0)
         mean = xp.sum(xp.where(here, weight * gap, zero), axis=0) / xp.where(total > 0, total, xp.ones_like(total))
         bias = xp.where(total > 0, mean, bias)
-    return bias * rated / (rated + 4.0)
+    return bias * rated / (rated + DRAWN)
 
 
 def own_variance(
@@ -226,19 +270,17 @@ def leave_one_out_medians(
         reward: Observed.
     """
     xp = namespace(said)
-    top = xp.full_like(said, xp.finfo(said.dtype).max)
-    values = xp.concat([reward[:, None], xp.where(here, said, top)], axis=-1)
-    order = xp.argsort(values, axis=-1)
-    place = xp.argsort(order, axis=-1)[:, 1:]  # of each rater among all
-    ranked = xp.take_along_axis(values, order, axis=-1)
-    left = xp.sum(xp.astype(here, place.dtype), axis=-1)[:, None] + xp.zeros_like(place)  # with the reward, without k
+    values = xp.concat([reward[:, None], xp.where(here, said, xp.full_like(said, xp.finfo(said.dtype).max))], axis=-1)
+    left = _number(here, axis=-1)  # how many values there are, with the reward and without the rater
+    last = values.shape[-1] - 1
+    low, high = xp.maximum(left - 1, 0 * left) // 2, left // 2
+    ranked = smallest(values, xp.clip(xp.concat([low, low + 1, high, high + 1], axis=-1), 0, last), axis=-1)
 
-    def without(index: Array) -> Float[Array, "n K"]:
-        return xp.take_along_axis(ranked, index + xp.astype(index >= place, index.dtype), axis=-1)
+    def without(first: int) -> Float[Array, "n K"]:
+        here, following = ranked[:, first : first + 1], ranked[:, first + 1 : first + 2]
+        return xp.where(said > here, here, following)
 
-    last = ranked.shape[-1] - 2
-    low, high = xp.clip((left - 1) // 2, 0, last), xp.clip(left // 2, 0, last)
-    return xp.where(here, 0.5 * without(low) + 0.5 * without(high), xp.zeros_like(said))
+    return xp.where(here, 0.5 * without(0) + 0.5 * without(2), xp.zeros_like(said))
 
 
 def masked_median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis: int = 0) -> Float[Array, "*rest"]:
@@ -249,8 +291,8 @@ def masked_median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis:
         >>> float(masked_median(np.array([1.0, 3.0, 4.0, 99.0]), np.array([True, True, True, False])))
         3.0
     """
-    low, high = _middles(values, mask, axis)
-    return 0.5 * low + 0.5 * high
+    number = _number(mask, axis)
+    return _median(values, mask, namespace(number).concat([(number - 1) // 2, number // 2], axis=axis), axis)
 
 
 def lower_median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis: int = 0) -> Float[Array, "*rest"]:
@@ -261,17 +303,18 @@ def lower_median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis: 
         >>> float(lower_median(np.array([1.0, 3.0, 4.0, 99.0]), np.array([True, True, False, False])))
         1.0
     """
-    return _middles(values, mask, axis)[0]
+    return _median(values, mask, (_number(mask, axis) - 1) // 2, axis)
 
 
-def _middles(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis: int) -> tuple[Any, Any]:
+def _number(mask: Bool[Array, "*any"], axis: int) -> Array:
+    xp = namespace(mask)
+    return xp.sum(xp.astype(mask, xp.int64 if hasattr(mask, "detach") else xp.int32), axis=axis, keepdims=True)
+
+
+def _median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], index: Array, axis: int) -> Float[Array, "*rest"]:
+    """Return the mean of the order statistics of the masked-in values at these indices, 0 where there are no values."""
     xp = namespace(values)
-    ranked = xp.sort(xp.where(mask, values, xp.full_like(values, xp.finfo(values.dtype).max)), axis=axis)
-    count = xp.sum(xp.astype(mask, xp.int64 if hasattr(values, "detach") else xp.int32), axis=axis, keepdims=True)
-    one = xp.ones_like(count)
-
-    def at(index: Array) -> Array:
-        found = xp.squeeze(xp.take_along_axis(ranked, index, axis=axis), axis=axis)
-        return xp.where(xp.squeeze(count, axis=axis) > 0, found, 0.0 * found)
-
-    return at(xp.maximum(count - one, 0 * one) // 2), at(xp.minimum(count // 2, one * (values.shape[axis] - 1)))
+    top = xp.full_like(values, xp.finfo(values.dtype).max)
+    found = smallest(xp.where(mask, values, top), xp.maximum(index, 0 * index), axis)
+    middle = xp.sum(found / found.shape[axis], axis=axis)
+    return xp.where(xp.any(mask, axis=axis), middle, xp.zeros_like(middle))

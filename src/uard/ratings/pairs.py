@@ -13,6 +13,10 @@ CELLS = 2_000_000  # of a table whose raters are compared by pairs, at least 500
 MOST_RATERS = 2_000  # that are compared by pairs
 EXACT = 1e-12  # of the largest: a spread below this is rounding
 ENOUGH = 30  # rows that a correlation of two raters takes
+FEWEST = 10  # rows that a mean or a spread of two raters takes
+APART = 3.0  # times the scale of another rater: another unit
+SHIFTED = 1.75  # standard deviations of both between their means: another unit
+TELLING = 3.0  # standard errors of a correlation that two raters rate the same thing
 
 
 class Shared(NamedTuple):
@@ -114,3 +118,72 @@ def residuals(ratings: Float[np.ndarray, "n K"], against: Float[np.ndarray, "n p
             error: np.ndarray = x - design[rows] @ line_of_rater
             left[rows, k] = np.where(np.abs(error).max() > 1e-9 * np.abs(x).max(), error, 0.0)
     return left
+
+
+def units_of(both: Shared) -> Integer[np.ndarray, " K"] | None:
+    """Return the number of each rater's unit, 0..U-1, -1 where it is not known; None if there is but one.
+
+    Two raters who rate the same thing (their correlation on the rows that both rated is over three standard errors
+    above 0) are in different units if their scales differ by a factor of over 3, or their means by over 1.75 standard
+    deviations. How much noise each has is not known; but the slope of a regression of the wider on the narrower is
+    no larger than the ratio of their scales, whatever the noise (Frisch 1934), so noise alone makes no unit.
+
+    Examples:
+        >>> stars = np.arange(20.0)
+        >>> units_of(shared(np.column_stack([stars, 10 * stars, stars + 1]))).tolist()
+        [0, 1, 0]
+    """
+    known = (both.rows >= FEWEST) & (both.correlation * np.sqrt(both.rows) > TELLING)
+    np.fill_diagonal(known, False)
+    narrow, wide = np.minimum(both.sd, both.sd.T), np.maximum(both.sd, both.sd.T)
+    known &= narrow > 0
+    slope = both.correlation * wide / np.where(known, narrow, 1.0)
+    shift = np.abs(both.mean - both.mean.T) / np.where(known, np.hypot(narrow, wide) / np.sqrt(2.0), 1.0)
+    apart = known & ((slope > APART) | (shift > SHIFTED))
+    if not apart.any():
+        return None
+    unit = np.full(len(apart), -1)
+    left = known.any(1)
+    number = 0
+    while left.any():  # connected parts of the graph of raters whom nothing sets apart
+        part = np.zeros_like(left)
+        part[int(np.argmax(left))] = True
+        while (more := left & ~part & (~apart[part]).any(0)).any():
+            part |= more
+        unit[part], left, number = number, left & ~part, number + 1
+    return unit if number > 1 else None
+
+
+def line_between(both: Shared, of: int, to: Integer[np.ndarray, " m"]) -> tuple[float, float] | None:
+    """Return slope and offset of the line that gives a rater's ratings the mean and the spread of others.
+
+    Examples:
+        >>> both = shared(np.column_stack([np.arange(20.0), 50 + 10 * np.arange(20.0)]))
+        >>> [round(x, 6) for x in line_between(both, 1, np.array([0]))]
+        [0.1, -5.0]
+
+    Args:
+        both: What they have in common.
+        of: Number of the rater.
+        to: Numbers of the others; the line is the mean of those to each of them.
+
+    Returns:
+        None where there are fewer than ten common rows with any, or the rater's answers are all equal there.
+    """
+    to = to[(both.rows[of, to] >= FEWEST) & (both.sd[of, to] > 0)]
+    if not to.size:
+        return None
+    slope = float((both.sd[to, of] / both.sd[of, to]).mean())
+    return slope, float((both.mean[to, of] - slope * both.mean[of, to]).mean())
+
+
+def equal_share(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], tolerance: float) -> float:
+    """Return in which share of the rows that have both they are equal; 0 below 30 rows, or where b is constant.
+
+    Examples:
+        >>> equal_share(np.arange(40.0), np.arange(40.0) + 1e-9, tolerance=1e-6)
+        1.0
+    """
+    both = np.isfinite(a) & np.isfinite(b)
+    a, b = a[both], b[both]
+    return float((np.abs(a - b) <= tolerance).mean()) if a.size >= ENOUGH and np.ptp(b) > 0 else 0.0

@@ -17,6 +17,7 @@ How a panel rates a step is a law, and an answer is drawn from it:
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, fields
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -370,6 +371,16 @@ def _rater(kind: str, random: np.random.Generator, scale: float, stars: int | No
     )
 
 
+def is_for_development(seed: int) -> bool:
+    """Whether what is drawn from a seed may be tuned on: even ones below 1000. All others are for what is reported.
+
+    Examples:
+        >>> [is_for_development(seed) for seed in (998, 999, 1000)]
+        [True, False, False]
+    """
+    return seed % 2 == 0 and seed < 1000
+
+
 def random_share(seed: int) -> float:
     """Return which share of the steps a random panel's raters are asked about: 1, 1, 0.3, 0.1 or 0.03.
 
@@ -380,8 +391,54 @@ def random_share(seed: int) -> float:
     return float(np.random.default_rng([seed, 2]).choice([1.0, 1.0, 0.3, 0.1, 0.03]))
 
 
+KINDS = ("truthful", "tempted", "repeating the proxy", "answering at random", "contrary", "vetoing")
+
+
+def kind_of(rater: Rater) -> str:
+    """Return which of ``KINDS`` a rater is: what matters most of it.
+
+    Examples:
+        >>> kind_of(Rater(bias=2.0)), kind_of(Rater(temptation=0.5)), kind_of(Rater(scale=-1.0))
+        ('truthful', 'tempted', 'contrary')
+    """
+    truthful, tempted, repeating, spamming, contrary, vetoing = KINDS
+    if rater.lapse == 1:
+        return spamming
+    if rater.scale < 0:
+        return contrary
+    if rater.veto_above is not None:
+        return vetoing
+    return repeating if rater.temptation == 1 else tempted if rater.temptation > 0 else truthful
+
+
+def composition(panel: Panel) -> str:
+    """Say in one line who sits in a panel: kinds, and the ranges of noise, bias and coverage.
+
+    Examples:
+        >>> composition(random_panel(9))
+        '2 raters: 2 truthful; noise 0.527 to 1.59; bias -0.357 to 0.238; coverage 0.2 to 1'
+        >>> composition(MAIN)
+        '3 raters: 1 truthful, 2 tempted; noise 0.1'
+    """
+    kinds = [kind_of(rater) for rater in panel.raters]
+    who = ", ".join(f"{kinds.count(kind)} {kind}" for kind in KINDS if kind in kinds)
+    parts = [f"{len(kinds)} rater{'s' * (len(kinds) > 1)}: {who}"]
+    for name, usual in (("noise", None), ("bias", 0.0), ("coverage", 1.0)):
+        values = sorted(getattr(r, name) for r in panel.raters if r.lapse < 1 or name == "coverage")
+        if values and values != [usual] * len(values):
+            low, high = f"{values[0]:.3g}", f"{values[-1]:.3g}"
+            parts.append(f"{name} {low}" if low == high else f"{name} {low} to {high}")
+    if any(r.outliers for r in panel.raters):
+        parts.append("with outliers")
+    if stars := {r.stars for r in panel.raters if r.stars}:
+        parts.append(f"{' or '.join(map(str, sorted(stars)))} stars")
+    return "; ".join(parts)
+
+
 def as_panel(panel: str | Panel) -> Panel:
     """Return the panel of a name, or the panel itself; ``random:7`` is ``random_panel(7)``.
+
+    ``random:7:0.3`` is ``random_panel(7, scale=0.3)``.
 
     Examples:
         >>> as_panel("single") is SINGLE and as_panel(SINGLE) is SINGLE
@@ -391,13 +448,16 @@ def as_panel(panel: str | Panel) -> Panel:
 
     Raises:
         UnknownNameError: with the nearest name.
-        InvalidValueError: a random panel whose seed is no whole number.
+        InvalidValueError: a random panel whose seed is no whole number, or whose scale is no number > 0.
     """
     if isinstance(panel, Panel):
         return panel
     if str(panel).startswith(RANDOM):
-        seed = panel.removeprefix(RANDOM)
-        if not (seed.isascii() and seed.isdecimal() and len(seed) < 20):
-            raise _checks.InvalidValueError("panel", panel, f"{RANDOM} and a whole number of at most 19 digits")
-        return random_panel(int(seed))
+        seed, *scale = panel.removeprefix(RANDOM).split(":", 1)
+        number = re.fullmatch(r"[0-9]{1,6}(\.[0-9]{1,9})?", scale[0]) if scale else None
+        positive = not scale or (number is not None and float(scale[0]) > 0)
+        if not (seed.isascii() and seed.isdecimal() and len(seed) < 20 and positive):
+            allowed = f"{RANDOM}SEED or {RANDOM}SEED:SCALE, a whole number of at most 19 digits and a number > 0"
+            raise _checks.InvalidValueError("panel", panel, allowed)
+        return random_panel(int(seed), *map(float, scale))
     return PANELS[_checks.choose("panel", panel, [*PANELS, f"{RANDOM}SEED"])]

@@ -64,9 +64,12 @@ def show(entries: Sequence[Entry]) -> None:
     """Print lines of the ledger, each as a paragraph: a table of so much text could not be read at 80 columns."""
     from rich.padding import Padding
 
+    from uard.replication import paper
+
     colour = {HOLDS: "green", IN_PART: "yellow", FAILS: "red", UNTESTABLE: "dim"}
     sign = {True: "+", False: "-", None: "?"}
     out = terminal.output()
+    out.print(terminal.escape(f"The paper: {paper.VERSION}"))
     for e in entries:
         out.print(f"[bold]{e.claim}[/bold] [{colour[e.verdict]}]{e.verdict}[/]" + f" ({e.count})" * bool(e.count))
         parts = (f"{sign[part.holds]} {part.name}" + " (opinion)" * part.opinion for part in e.parts)

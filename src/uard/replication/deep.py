@@ -95,8 +95,18 @@ def _rivals(p: Published) -> Table:
 def matched(p: Published) -> list[str]:
     """Say for each agent and panel whether ``uard-0.1`` has the highest true return among those that hack no more than it.
 
-    A rival counts as matched if its hack rate is not above ``uard-0.1``'s (95 % intervals overlap or it is lower).
+    A rival counts as matched if its hack rate is not above ``uard-0.1``'s. All rivals, agents and panels are one family of
+    paired tests for hacks, and one for true returns (Holm).
     """
+    every = [
+        (x, r)
+        for r in p.rows("deep-rivals", mitigation="uard-0.1")
+        for x in p.rows("deep-rivals", agent=r["agent"], panel=r["panel"])
+        if x is not r
+    ]
+    hacking, returns = (p.compare(every, metric) for metric in ("hacks", "true_return"))
+    more = [x for i, (x, _) in enumerate(every) if hacking.above(i)]
+    richer = [x for i, (x, _) in enumerate(every) if returns.above(i)]
     out = []
     for agent in dict.fromkeys(r["agent"] for r in p.rows("deep-rivals")):
         for panel in ("main", "appendix"):
@@ -104,10 +114,9 @@ def matched(p: Published) -> list[str]:
             mine = [r for r in group if r["mitigation"] == "uard-0.1"]
             if not mine:
                 continue
-            bound = p.of(mine[0], "hacks").ci95[1]
-            equals = [r for r in group if r is not mine[0] and p.of(r, "hacks").ci95[0] <= bound]
+            equals = [r for r in group if r is not mine[0] and r not in more]
             own = p.of(mine[0], "true_return")
-            better = [r for r in equals if p.of(r, "true_return").ci95[0] > own.ci95[1]]
+            better = [r for r in equals if r in richer]
             higher = [r for r in equals if p.of(r, "true_return").mean > own.mean and r not in better]
             names = ", ".join(r["mitigation"] for r in equals)
             rivals = f"matched in hack rate by {names}" if names else "no rival hacks as rarely"
@@ -123,7 +132,7 @@ def matched(p: Published) -> list[str]:
             else:
                 text += "; the highest"
             out.append(text + ".")
-    return out
+    return [*out, f"Deep rivals, true return against uard: {returns.caption()}"] if every else out
 
 
 def losses(p: Published) -> list[str]:
@@ -144,14 +153,19 @@ def losses(p: Published) -> list[str]:
             f"On the true reward of 10x10 these agents miss 95 % goals in the paper's budget, so what they do there with uard-0.1 says little: {goals}."
         )
     out += matched(p)
-    for r in p.rows("deep-feedback", source="table"):
-        for model in p.rows("deep-feedback", source="model", rated=r["rated"]):
-            table, learned = p.of(r, "true_return"), p.of(model, "true_return")
-            if table.ci95[0] > learned.ci95[1]:
-                out.append(
-                    f"With {100 * r['rated']:g} % of steps rated, the learned model of the ratings does worse than a table of running "
-                    f"means: {full(learned)} against {full(table)}. Here it extrapolates what few ratings do not support."
-                )
+    sources = [
+        (r, model)
+        for r in p.rows("deep-feedback", source="table")
+        for model in p.rows("deep-feedback", source="model", rated=r["rated"])
+    ]
+    family = p.compare(sources, "true_return")
+    for i, (r, model) in enumerate(sources):
+        if family.above(i):
+            table, learned = (full(p.of(x, "true_return")) for x in (r, model))
+            out.append(
+                f"With {100 * r['rated']:g} % of steps rated, the learned model of the ratings does worse than a table of running "
+                f"means: {learned} against {table}. Here it extrapolates what few ratings do not support. {family.caption()}"
+            )
     settings = [
         (r, f"{r['agent']}, {r['panel']} panel, very noisy raters")
         for r in p.rows("deep-rivals", mitigation="uard-0.1")

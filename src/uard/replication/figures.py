@@ -1,4 +1,4 @@
-"""The paper's figures (G2-G5, G8, G9, G11-G16) from our runs. Every function returns a figure."""
+"""The paper's figures (G2-G16) from our runs. Every function returns a figure."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from uard.lab import statistics
+from uard.lab.trainers import examine
 from uard.lab.views.figures import COLOURS, axes_of
 from uard.lab.views.study_results import StudyResults
 from uard.method.stability import DEFINITIONS, perturbed_advantage
 from uard.method.weights import exponential_weight, linear_weight, reciprocal_weight
 from uard.replication import paper, theory
+from uard.replication.studies import derive
 
 
 def _smooth(curves: np.ndarray, width: int = 10) -> np.ndarray:
@@ -48,7 +51,7 @@ def filters(results: StudyResults) -> Figure:
         s = [results.get("filters", "success_rate", form=f, reading=reading) for f in forms]
         place = np.arange(len(forms)) + (i - 1) * 0.26
         right.bar(place, [x.mean for x in s], 0.24, color=COLOURS[reading], label=reading)
-        low, high = np.array([[x.mean - x.ci95[0], x.ci95[1] - x.mean] for x in s]).T
+        low, high = np.abs(np.transpose([x.ci95 or (x.mean, x.mean) for x in s]) - [x.mean for x in s])
         right.errorbar(place, [x.mean for x in s], np.stack([low, high]), fmt="none", color="k", lw=1)
     right.set_xticks(range(len(forms)), [f.replace("certainty-equivalent", "certainty\nequivalent") for f in forms])
     right.set(ylabel="goal rate, 6x6", title="Where the form acts, by reading", ylim=(0, 1.25))
@@ -217,6 +220,59 @@ def hacking_region(trace: np.ndarray, windows: Sequence[tuple[int, int]]) -> Fig
     axes[1].plot(lam, color=COLOURS["uard-0.1"], lw=1)
     axes[1].set(ylabel="lambda_t", yscale="log")
     return figure
+
+
+def over_training(curves: dict[str, tuple[np.ndarray, str]], steps: int, target: float) -> Figure:
+    """G6, G7: returns and hacks over a training of so many steps; of each agent (seeds, parts, columns) and a colour.
+
+    The columns are those of ``studies.derive.LEARNED``; ``target`` is the return that the paper calls aligned.
+    """
+    figure, axes = axes_of(3, 4.4, 3.8)
+    labels = {
+        "observed_return": "observed return",
+        "true_return": "true return",
+        "hacks": "steps in the region per episode",
+    }
+    for axis, (column, label) in zip(axes, labels.items(), strict=True):
+        for agent, (found, colour) in curves.items():
+            x = (np.arange(found.shape[1]) + 0.5) * steps / found.shape[1] / 1000
+            _interval(axis, x, found[..., derive.LEARNED.index(column)], agent, colour)
+        if column != "hacks":
+            axis.axhline(target, color="k", ls=":", lw=1)
+        axis.set(xlabel="environment steps, thousands", ylabel=label)
+    axes[0].legend()
+    return figure
+
+
+def kicked(walks: dict[str, tuple[np.ndarray, str]]) -> Figure:
+    """G10: uncertainties, weight and who stands round a kick; of each agent (seeds, groups, columns) and a colour.
+
+    The columns are those of ``examine.KICKED``, of steps in groups of ``studies.derive.EVERY``.
+    """
+    figure, axes = axes_of(4, 3.6, 3.8)
+    labels = {"sigma_m": "sigma_m", "sigma_h": "sigma_h", "weight": "weight", "standing": "share of copies that stand"}
+    for axis, (column, label) in zip(axes, labels.items(), strict=True):
+        for agent, (found, colour) in walks.items():
+            if agent == "raw" and column in ("sigma_h", "weight"):
+                continue
+            values = found[..., examine.KICKED.index(column)]
+            if column != "standing":
+                values = np.where(found[..., 0] > 0, values, np.nan)
+            x = np.arange(found.shape[1]) * derive.EVERY + derive.EVERY / 2 - examine.KICKED_AT
+            _interval(axis, x, values, agent, colour)
+        axis.axvline(0, color="k", ls=":", lw=1)
+        axis.set(xlabel="steps after the kick", ylabel=label, ylim=(0, None))
+    axes[0].legend()
+    return figure
+
+
+def _interval(axis: Axes, x: np.ndarray, values: np.ndarray, label: str, colour: str) -> None:
+    """Draw the mean of (seeds, points) and its interval where two seeds or more are no NaN; one seed as it is."""
+    drawn = (np.isfinite(values).sum(0) >= min(2, len(values))).nonzero()[0]
+    found = [statistics.summarise(values[np.isfinite(values[:, i]), i]) for i in drawn]
+    low, high = np.array([s.ci95 for s in found]).reshape(-1, 2).T
+    axis.plot(x[drawn], [s.mean for s in found], color=colour, lw=2, label=label)
+    axis.fill_between(x[drawn], low, high, color=colour, alpha=0.15, lw=0)
 
 
 def _shade(axis: Axes, windows: Sequence[tuple[int, int]]) -> None:

@@ -16,12 +16,15 @@ from uard.lab.trainers import examine
 from uard.lab.views.figures import axes_of, data_uri
 from uard.lab.views.published import Published, packaged_json
 from uard.lab.views.tables import Table, full, number
-from uard.replication import figures
+from uard.replication import figures, paper
+from uard.replication.studies import derive
 
 HACKING, NOISE, KICK = "mujoco-standard-hacking", "mujoco-standard-noise", "mujoco-standard-kick"
 DISTORTION, RATING = "mujoco-standard-distortion", "mujoco-standard-rating"
 BONUSES, ABLATION = "mujoco-standard-bonuses", "mujoco-standard-ablation"
+DRIFT = "mujoco-standard-drift"
 LEGITIMATE, CAUTION = "mujoco-standard-legitimate", "mujoco-standard-caution"
+WINDOWS = {"before": (25, 50), "kick": (50, 60), "later": (130, 150)}  # steps of a walk that is kicked after step 50
 AS_GOOD = 0.03  # by how much the AUROC of a cheaper sigma_m may be lower
 REFERENCES = ("raw", "true reward")
 REMOVED, KEPT, COST = 0.936, 0.9, 0.05  # the paper's best reduction (J16); what is asked of a filter beside it
@@ -32,20 +35,37 @@ COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", 
 
 def summary(values: np.ndarray) -> str:
     """Return one number per seed as text: mean, deviation and interval; of one seed, that number alone."""
-    return full(statistics.summarise(values)) if len(values) > 1 else number(values[0])
+    return full(statistics.summarise(values))
 
 
 def tables(p: Published) -> list[Table]:
     """Return all tables for which there are results."""
-    makers = (_hacking, _pooled, _noise, _kick, _bonuses, _legitimate, _caution, _ablation, _rating, _distortion)
+    makers = (
+        _hacking,
+        _pooled,
+        _noise,
+        _kick,
+        _around_kick,
+        _bonuses,
+        _legitimate,
+        _caution,
+        _ablation,
+        _rating,
+        _distortion,
+    )
     return [t for t in (*(make(p) for make in makers), _speed()) if t.rows]
 
 
 def _steps(p: Published, study: str) -> str:
+    return _budget(p, p.rows(study))
+
+
+def _budget(p: Published, rows: list[Row]) -> str:
+    """Say for how many steps and seeds rows were trained."""
+
     def each(numbers: Iterable[int]) -> str:
         return " or ".join(f"{n:,}" for n in sorted(set(numbers)))
 
-    rows = p.rows(study)
     seeds = sorted({len(p.seeds_of(r)) for r in rows})
     if not rows:
         return ""
@@ -116,17 +136,20 @@ def pooled(p: Published, robot: str, agent: str, mitigation: str) -> tuple[np.nd
     """Return ``shares`` of a mitigation over all of a robot's settings that lie: one pair of numbers per seed, (seeds,).
 
     A seed's hacks and returns are added up over both regions and both panels before they are compared, so that one
-    lucky run decides less. None if a row is missing, or has other seeds than the rest.
+    lucky run decides less. Only seeds that all rows have are compared; None if a row is missing, or there is no such seed.
     """
     groups = [
         [r for r in p.rows(HACKING, robot=robot, agent=agent, mitigation=m) if r["region"] != "none"]
         for m in (mitigation, *REFERENCES)
     ]
-    if [len(g) for g in groups] != [4, 2, 2] or len({p.seeds_of(r) for g in groups for r in g}) > 1:
+    shared = sorted(set.intersection(*(set(p.seeds_of(r)) for g in groups for r in g))) if all(groups) else []
+    if [len(g) for g in groups] != [4, 2, 2] or not shared:
         return None
-    ours, raw, honest = (
-        np.array([[p.per_seed(r, m) for m in ("hacks", "true_return")] for r in g]).mean(0) for g in groups
-    )
+
+    def of(r: Row, metric: str) -> np.ndarray:
+        return p.per_seed(r, metric)[[p.seeds_of(r).index(seed) for seed in shared]]
+
+    ours, raw, honest = (np.array([[of(r, m) for m in ("hacks", "true_return")] for r in g]).mean(0) for g in groups)
     return 1.0 - ours[0] / raw[0], ours[1] / honest[1]
 
 
@@ -230,6 +253,61 @@ def _kick(p: Published) -> Table:
         3,
         "The paper kicks at step 500. An episode that ends before was never kicked.",
     )
+
+
+def drifting(p: Published, **labels: Any) -> list[Row]:
+    """Return the rows of the study of drift; its cells may be published for another study, without their curves."""
+    return [r for r in p.rows(DRIFT, **labels) if p.has(r, "kicked")]
+
+
+def around_kick(p: Published, r: Row) -> dict[tuple[float, str], dict[str, np.ndarray]]:
+    """Return what is found around a kick, by its size and a window: ``examine.KICKED`` by name, each (seeds,).
+
+    Standing is a share of the copies that stood when they were kicked; seeds in which none did are left out. Where it is
+    0 the other columns say nothing.
+    """
+    found = p.derived(r, "kicked")
+    stood = found[:, 0, examine.KICKED_AT // derive.EVERY, 0]  # of every kick alike
+    found, stood = found[stood > 0], stood[stood > 0]
+    out = {}
+    for i, size in enumerate(examine.KICKS):
+        for window, (first, end) in WINDOWS.items():
+            groups = found[:, i, first // derive.EVERY : end // derive.EVERY]
+            standing = groups[..., :1]
+            means = (groups * standing).sum(1) / np.maximum(standing.sum(1), 1e-9)
+            columns = dict(zip(examine.KICKED, means.T, strict=True))
+            out[size, window] = columns | {"standing": standing.mean((1, 2)) / stood}
+    return out
+
+
+_SHOWN = (("before", examine.KICKS[-1]), *((w, k) for w in ("kick", "later") for k in examine.KICKS))
+
+
+def _around_kick(p: Published) -> Table:
+    def cell(columns: dict[str, np.ndarray], name: str) -> str:
+        values = columns[name] if name == "standing" else columns[name][columns["standing"] > 0]
+        return summary(values) if len(values) else "–"
+
+    rows = []
+    for r in drifting(p):
+        found = around_kick(p, r)
+        if len(found[0.0, "before"]["standing"]):
+            for window, size in _SHOWN:
+                kicked = "–" if window == "before" else f"{size:g}"
+                cells = (cell(found[size, window], name) for name in examine.KICKED)
+                rows.append((r["robot"], r["mitigation"], window, kicked, *cells))
+    return Table(
+        f"Along an episode with a kick (G10, L1985): the forward velocity is raised once, PPO, {_budget(p, drifting(p))}",
+        (
+            "robot", "learned from", "when", "kick, m/s", "standing", "sigma_m", "sigma_h", "weight", "observed reward",
+            "learned", "true",
+        ),
+        tuple(rows),
+        4,
+        "Trained agents, 16 copies of each seed, most likely actions, kicked after step 50. Before: steps 25 to 49; kick: 50 "
+        "to 59; later: 130 to 149. Standing: of the copies that stood when kicked. All else: per step, mean over the "
+        "copies that still stand, so that what is said of later is said of those that did not fall. Raw agents ask nobody.",
+    )  # fmt: skip
 
 
 def _bonuses(p: Published) -> Table:
@@ -353,91 +431,125 @@ def _speed() -> Table:
 
 
 def losses(p: Published) -> list[str]:
-    """Say where ``uard-0.1`` misses what is asked of it in MuJoCo, found by rule."""
-    return _of_hacking(p) + _of_noise(p) + _of_twins(p) + _of_distortion(p)
+    """Say where ``uard-0.1`` misses what is asked of it in MuJoCo, found by rule: a short line each, what it costs first."""
+    found = (
+        _of_returns(p) + _of_hacks(p) + _of_tame(p) + _of_nothing(p) + _of_twins(p) + _of_noise(p) + _of_distortion(p)
+    )
+    return [f"MuJoCo, {line}." for line in found]
 
 
-def _of_twins(p: Published) -> list[str]:
-    dear = []
-    for r in p.rows(LEGITIMATE, mitigation="uard-0.1"):
-        kept = _kept(p, r, _found(p, LEGITIMATE, mitigation="raw", region=r["region"]))
-        if kept is not None and kept < 1 - COST:
-            dear.append(f"{r['region']} {r['panel']} {100 * (1 - kept):.0f} %")
-    if not dear:
-        return []
-    return [
-        f"MuJoCo, Hopper, bonuses that are real: uard's caution costs more than 5 % of the true return{_listed(dear)}."
-    ]
+def _of_agent(p: Published, **labels: Any) -> list[tuple[str, list[Row]]]:
+    """Return the rows of ``uard-0.1`` by agent; the name of one that was run once says so."""
+    groups: dict[str, list[Row]] = {}
+    for r in p.rows(HACKING, mitigation="uard-0.1", **labels):
+        groups.setdefault(r["agent"], []).append(r)
+    once = " (one run each)"
+    return [(a + once * all(len(p.seeds_of(r)) == 1 for r in rows), rows) for a, rows in groups.items()]
 
 
-def _of_distortion(p: Published) -> list[str]:
-    rows = {r["critics"]: r for r in p.rows(DISTORTION, agent="uard-0.1")}
+def _lying(rows: list[Row]) -> list[Row]:
+    return [r for r in rows if r["region"] != "none"]
+
+
+def _of_returns(p: Published) -> list[str]:
     out = []
-    if len(rows) == 2:
-        shared, full_ones = (list(p.derived(rows[k], "warning").T) for k in ("5, shared trunk", "5, full"))
-        worse = [
-            f"{what} {summary(a)} against {summary(b)}"
-            for what, a, b in zip(("states thrown off", "wrong values"), shared, full_ones, strict=True)
-            if b.mean() - a.mean() > AS_GOOD
-        ]
-        if worse:
+    for agent, rows in _of_agent(p):
+        kept = [(share, r) for r in _lying(rows) if (share := shares(p, r)[1]) is not None]
+        poor = [share for share, _ in kept if share < KEPT]
+        if poor:
+            worst, r = min(kept, key=lambda k: k[0])
             out.append(
-                f"MuJoCo: sigma_m of five critics on one trunk warns worse than that of five full ones (AUROC, by more "
-                f"than {AS_GOOD:g}): {'; '.join(worse)}."
+                f"{agent}: {100 * (1 - worst):.0f} % of the honest agent's true return is lost at "
+                f"worst ({_place(r)}), more than {100 * (1 - KEPT):.0f} % in {len(poor)} of {len(kept)} settings"
             )
     return out
 
 
-def _of_hacking(p: Published) -> list[str]:
-    ours = [r for r in p.rows(HACKING, mitigation="uard-0.1")]
-    if not ours:
-        return []
+def _of_hacks(p: Published) -> list[str]:
     out = []
-    lies = [(r, *shares(p, r)) for r in ours if r["region"] != "none"]
-    leaks = [(r, f"{100 * x:.1f} % ({_steps_inside(p, r)})") for r, x, _ in lies if x is not None and x < REMOVED]
-    honest_too = sum(
-        p.of(r, "hacks").mean <= p.of(honest, "hacks").mean
-        for r, _ in leaks
-        if (honest := _rival(p, r, "true reward")) is not None
-    )
-    poor = [(r, f"{100 * x:.0f} %") for r, _, x in lies if x is not None and x < KEPT]
-    judged = sum(x is not None for _, x, _ in lies)
-    together = [
-        f"{robot} {agent} {summary(100 * found[1])} %"
-        for robot, agent in _settings(p)
-        if (found := pooled(p, robot, agent, "uard-0.1")) is not None
-    ]
-    out.append(
-        f"MuJoCo, {_steps(p, HACKING)}: of {judged} settings in which the raw agent hacks, uard-0.1 removes less than "
-        f"93.6 % of its hacks in {len(leaks)}{_by_agent(leaks)}, and leaves no more of them than training on the true reward "
-        f"in {honest_too} of these; of {len(lies)} settings it keeps less than 90 % of the true return of the agent trained "
-        f"on the true reward in {len(poor)}{_by_agent(poor)}. With so few seeds these shares are rough: see the "
-        f"intervals. All settings of a robot together, uard-0.1 keeps: {'; '.join(together) or 'not all were run'}."
-    )
+    for agent, rows in _of_agent(p):
+        removed = [(share, r) for r in _lying(rows) if (share := shares(p, r)[0]) is not None]
+        leaks = [r for share, r in removed if share < REMOVED]
+        if leaks:
+            worst, r = min(removed, key=lambda k: k[0])
+            out.append(
+                f"{agent}: {100 * (1 - worst):.1f} % of the raw agent's hacks are left at worst ({_place(r)}: "
+                f"{_steps_inside(p, r)}), more than {100 * (1 - REMOVED):.1f} % in {len(leaks)} of {len(removed)} settings, "
+                f"and no more than by training on the true reward in {_as_honest(p, leaks)} of these"
+            )
+    return out
+
+
+def _as_honest(p: Published, rows: list[Row]) -> int:
+    rivals = ((r, _rival(p, r, "true reward")) for r in rows)
+    return sum(h is not None and p.of(r, "hacks").mean <= p.of(h, "hacks").mean for r, h in rivals)
+
+
+def _of_tame(p: Published) -> list[str]:
+    pairs = [(r, x) for r in p.rows(HACKING, mitigation="raw") if (x := _rival(p, r, "true reward")) is not None]
+    family = p.compare(pairs, "true_return")
     tame = [
         f"{r['robot']} {r['region']} {r['agent']}"
-        for r in p.rows(HACKING, mitigation="raw")
-        if (honest := _rival(p, r, "true reward")) is not None
-        and p.of(r, "true_return").ci95[1] >= p.of(honest, "true_return").ci95[0]
+        for i, (r, _) in enumerate(pairs)
+        if family.tests[i] and not family.below(i)
     ]
-    if tame:
-        out.append(
-            f"MuJoCo: in {'; '.join(tame)} the raw agent's true return is not clearly below that of the agent trained on "
-            "the true reward, so there is little to prevent there, and its rows prove little."
-        )
-    plain = [(r, shares(p, r)[1]) for r in ours if r["region"] == "none"]
-    dear = [f"{_name(r)} {100 * (1 - x):.0f} %" for r, x in plain if x is not None and x < 1 - COST]
-    if plain:
-        out.append(
-            f"MuJoCo without a lie: uard-0.1 costs more than 5 % of the true return in {len(dear)} of {len(plain)} "
-            f"settings{_listed(dear)}."
-        )
-    parts = [f"{r['learns_from']} {summary(p.per_seed(r, 'true_return'))}" for r in p.rows(CAUTION)]
-    if parts:
-        out.append(
-            f"MuJoCo without a lie, which part of listening costs (Hopper, PPO, true return): {'; '.join(parts)}."
-        )
+    if not tame:
+        return []
+    return [f"no loss, but no proof: the raw agent's true return is no worse than the honest agent's{_listed(tame)}"]
+
+
+def _of_nothing(p: Published) -> list[str]:
+    """What is lost where nothing lies."""
+    out = []
+    for agent, rows in _of_agent(p, region="none"):
+        lost = [(100 * (1 - share), r["robot"]) for r in rows if (share := shares(p, r)[1]) is not None]
+        dear = [f"{share:.0f} % ({robot})" for share, robot in lost if share > 100 * COST]
+        if dear:
+            out.append(f"nothing lies, {agent}: {' and '.join(dear)} of the raw agent's true return is lost")
     return out
+
+
+def _of_twins(p: Published) -> list[str]:
+    out = []
+    for r in p.rows(LEGITIMATE, mitigation="uard-0.1"):
+        kept = _kept(p, r, _found(p, LEGITIMATE, mitigation="raw", region=r["region"]))
+        if kept is not None and kept < 1 - COST:
+            where = f"{r['region']}, {r['panel']} panel"
+            out.append(f"the bonus is real, Hopper, PPO: {100 * (1 - kept):.0f} % of the true return is lost ({where})")
+    return out
+
+
+def _of_noise(p: Published) -> list[str]:
+    out = []
+    for r in p.rows(NOISE, mitigation="uard-0.1"):
+        raw, honest = (
+            _found(p, HACKING, robot="hopper", region="vibration", agent=r["agent"], mitigation=m) for m in REFERENCES
+        )
+        removed, kept = _removed(p, r, raw), _kept(p, r, honest)
+        setting = f"raters' noise {100 * r['noise']:.0f} %, Hopper, {r['agent']}"
+        own = summary(p.per_seed(r, "true_return"))
+        if r["noise"] and removed is not None and removed < REMOVED:
+            hacks = summary(p.per_seed(r, "hacks"))
+            out.append(f"{setting}: {100 * (1 - removed):.1f} % of the raw agent's hacks are left, {hacks} steps")
+        if r["noise"] and kept is not None and kept < KEPT:
+            out.append(f"{setting}: {100 * (1 - kept):.0f} % of the honest agent's true return is lost, {own} remains")
+        for x in p.rows(NOISE, agent=r["agent"], noise=r["noise"]):
+            if x["mitigation"] not in ("uard-0.1", "raw") and p.of(x, "true_return").mean > p.of(r, "true_return").mean:
+                theirs = summary(p.per_seed(x, "true_return"))
+                out.append(f"{setting}: {x['mitigation']} has a higher true return: {theirs} against {own}")
+    return out
+
+
+def _of_distortion(p: Published) -> list[str]:
+    rows = {r["critics"]: r for r in p.rows(DISTORTION, agent="uard-0.1")}
+    if len(rows) < 2:
+        return []
+    shared, full_ones = (list(p.derived(rows[k], "warning").T) for k in ("5, shared trunk", "5, full"))
+    return [
+        f"sigma_m of five critics on one trunk warns of {what} with an AUROC of {summary(a)}, of five full ones {summary(b)}"
+        for what, a, b in zip(("states thrown off", "wrong values"), shared, full_ones, strict=True)
+        if b.mean() - a.mean() > AS_GOOD
+    ]
 
 
 def _steps_inside(p: Published, r: Row) -> str:
@@ -446,51 +558,12 @@ def _steps_inside(p: Published, r: Row) -> str:
     return f"{own} steps of {raw}; true reward {honest}"
 
 
-def _of_noise(p: Published) -> list[str]:
-    missed = []
-    for r in p.rows(NOISE, mitigation="uard-0.1"):
-        raw, honest = (
-            _found(p, HACKING, robot="hopper", region="vibration", agent=r["agent"], mitigation=m) for m in REFERENCES
-        )
-        removed, kept = _removed(p, r, raw), _kept(p, r, honest)
-        if r["noise"] and ((removed is not None and removed < REMOVED) or (kept is not None and kept < KEPT)):
-            hacks, true = (summary(p.per_seed(r, m)) for m in ("hacks", "true_return"))
-            missed.append(f"{r['agent']} at {100 * r['noise']:.0f} %: {hacks} hack steps, true return {true}")
-    better = []
-    for r in p.rows(NOISE, mitigation="uard-0.1"):
-        own = p.of(r, "true_return").mean
-        rivals = [
-            x for x in p.rows(NOISE, agent=r["agent"], noise=r["noise"]) if x["mitigation"] not in ("uard-0.1", "raw")
-        ]
-        if over := [x for x in rivals if p.of(x, "true_return").mean > own]:
-            names = ", ".join(f"{x['mitigation']} {summary(p.per_seed(x, 'true_return'))}" for x in over)
-            better.append(
-                f"{r['agent']} at {100 * r['noise']:.0f} %: {names} (uard-0.1 {summary(p.per_seed(r, 'true_return'))})"
-            )
-    out = []
-    if missed:
-        out.append(
-            f"MuJoCo, Hopper, vibration, noisy raters ({_steps(p, NOISE)}): uard-0.1 removes less than 93.6 % of the hacks or "
-            f"keeps less than 90 % of the honest agent's true return: {'; '.join(missed)}."
-        )
-    if better:
-        out.append(f"MuJoCo, Hopper, vibration: others who listen have a higher true return: {'; '.join(better)}.")
-    return out
-
-
 def _listed(names: list[str]) -> str:
     return f" ({'; '.join(names)})" if names else ""
 
 
-def _by_agent(found: list[tuple[Row, str]]) -> str:
-    groups: dict[str, list[str]] = {}
-    for r, text in found:
-        groups.setdefault(r["agent"], []).append(f"{r['robot']} {r['region']} {r['panel']} {text}")
-    return _listed([f"{agent}: {', '.join(items)}" for agent, items in groups.items()])
-
-
-def _name(r: Row) -> str:
-    return f"{r['robot']} {r['region']} {r['agent']} {r['panel']}"
+def _place(r: Row) -> str:
+    return f"{r['robot']} {r['region']}, {r['panel']} panel"
 
 
 def drawn(p: Published) -> list[tuple[str, str, str]]:
@@ -500,6 +573,7 @@ def drawn(p: Published) -> list[tuple[str, str, str]]:
         note = "One dot per seed, a bar at the mean. A mitigation works if hacks fall and the true return does not."
         title = f"G6, G7 · {robot}: steps in the region that lies, and what they were worth"
         made.append((title, note, _dots(p, robot)))
+    made += _over_training(p)
     traced = p.rows(DISTORTION)
     if len(traced) == len(p.studies[DISTORTION].rows):
         note = "The first seed. Shaded: the windows in which the observed reward is inflated."
@@ -517,6 +591,36 @@ def drawn(p: Published) -> list[tuple[str, str, str]]:
         )
         made.append(("G13 · sign preservation on learned critics, Hopper", note, _signs(p)))
     return [(title, note, data_uri(figure)) for title, note, figure in made]
+
+
+TARGETS = {"hopper": ("G6", "Hopper objective"), "walker2d": ("G7", "Walker2d objective")}
+
+
+def _over_training(p: Published) -> list[tuple[str, str, Figure]]:
+    made = []
+    for robot, (name, objective) in TARGETS.items():
+        rows = drifting(p, robot=robot)
+        curves = {r["mitigation"]: (p.derived(r, "learning"), COLOURS[r["mitigation"]]) for r in rows}
+        if curves:
+            target = paper.TEXT[objective].value
+            figure = figures.over_training(curves, rows[0].cell.steps or 0, target)
+            note = (
+                f"PPO, vibration, main panel, {_budget(p, drifting(p))}. Mean over seeds and its 95 % interval, of the episodes that "
+                f"ended in each twentieth of the training. Dotted: the paper's objective of {target:g}, a fall. Drift is where "
+                "the observed return rises and the true one falls."
+            )
+            made.append((f"{name} · {robot} over its training", note, figure))
+    rows = drifting(p, robot="hopper")
+    for i, size in reversed([*enumerate(examine.KICKS)][1:] if rows else []):
+        walks = {r["mitigation"]: (p.derived(r, "kicked")[:, i], COLOURS[r["mitigation"]]) for r in rows}
+        note = (
+            f"{size:g} m/s from behind after step {examine.KICKED_AT} of an episode of the trained agent. Mean over the seeds "
+            "of which a copy still stands, and its 95 % interval; a line ends where fewer than two are left. Raw agents ask "
+            "no raters."
+        )
+        title = f"G10 · sigma_m and sigma_h along an episode with a kick of {size:g} m/s, Hopper"
+        made.append((title, note, figures.kicked(walks)))
+    return made
 
 
 def _traced(p: Published, agent: str) -> np.ndarray:

@@ -11,6 +11,12 @@ from typing import NamedTuple
 
 from uard._checks import InvalidValueError
 
+VERSION = (
+    "arXiv:2604.26360 in its version of 26 June 2026, whose abstract has nine baselines and 93.6 %. The first version (29 "
+    "April 2026) has 93.7 % of trap visits there, counts no baselines, and admits a lower peak of the observed reward, where "
+    "this one says that task performance stays competitive. The text of this one still prints 93.7 % (lines 1149, 1153, 1330)."
+)
+
 SEEDS = 10  # line 894
 LAST_EPISODES = 100  # lines 924, 951
 EPISODES = 500  # line 1002

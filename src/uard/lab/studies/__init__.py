@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from functools import cache
 
 from uard import _checks
-from uard.lab.studies import games, grids, robots
+from uard.lab.studies import games, grids, panels, robots
 from uard.lab.studies import plugins as own
 from uard.lab.study import Study
 from uard.plugins import Plugin, PluginError, brought
@@ -43,7 +43,13 @@ def _joined() -> tuple[dict[str, tuple[Study, ...]], list[PluginError]]:
 
 @cache
 def _ours() -> dict[str, tuple[Study, ...]]:
-    return {"grid": grids.studies(), "games": games.studies(), "robots": robots.studies()}
+    return {
+        "grid": grids.studies(),
+        "games": games.studies(),
+        "panels": panels.studies(),
+        "robots": robots.studies(),
+        "panels-development": panels.studies(development=True),
+    }
 
 
 @cache

@@ -312,7 +312,7 @@ def _summaries(values: np.ndarray) -> dict[str, list[Any]]:
     return {
         "mean": [round(c.mean, 4) for c in columns],
         "sd": [round(c.sd, 4) for c in columns],
-        "ci95": [[round(x, 4) for x in c.ci95] for c in columns],
+        "ci95": [c.ci95 and [round(x, 4) for x in c.ci95] for c in columns],
     }
 
 

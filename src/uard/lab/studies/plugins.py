@@ -82,6 +82,8 @@ def compared_with(studies: Iterable[Study], others: Iterable[str]) -> tuple[Stud
         InvalidValueError: none of the studies compares mitigations, or a name is no mitigation.
     """
     studies, added = tuple(studies), {name: named(name) for name in dict.fromkeys(others)}
+    if not added:
+        return studies  # whose rows need not be built
     grown, compares = [], False
     for study in studies:
         places = [r for name in BESIDE for r in study.where(mitigation=name) if r.cell.mitigation == named(name)]
@@ -89,7 +91,7 @@ def compared_with(studies: Iterable[Study], others: Iterable[str]) -> tuple[Stud
         new = [_instead(r, name, r.cell.with_(mitigation=m)) for name, m in added.items() for r in places]
         rows = {r.labels: r for r in (*study.rows, *new)} | {r.labels: r for r in study.rows}
         grown.append(replace(study, rows=tuple(rows.values())))
-    if added and not compares:
+    if not compares:
         allowed = f"left out: none of {', '.join(s.name for s in studies)} compares mitigations"
         raise _checks.InvalidValueError("mitigation", ", ".join(added), allowed)
     return tuple(grown)

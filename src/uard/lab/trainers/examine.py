@@ -1,4 +1,4 @@
-"""What an agent trained in MuJoCo makes of a reward that is distorted after training (G12-G15), and what sigma_m knows.
+"""What an agent trained in MuJoCo makes of a lie or a kick after training (G10, G12-G15), and what sigma_m knows.
 
 The paper defines neither the distortion nor the "confidence-adjusted reward". These definitions are OURS, those of the
 grids (``uard.replication.distortion``) where they can be:
@@ -9,18 +9,23 @@ grids (``uard.replication.distortion``) where they can be:
   its backup; for EDAC less the critics' pessimism, mean less lowest.
 * The advantage of the agent's action over a random one (G13) is that of one step ahead, r + gamma V(s'), on the learned
   critics, with the reward of the random action's step raised by epsilon and then filtered.
+* A robot is kicked once (G10): 16 copies walk, and after step 50 the forward velocity is raised by 0, by 1, or by the
+  paper's 5. The paper kicks at step 500; there those of our agents that do their task have mostly fallen. What is said
+  of a step is the mean over the copies that still stand before it.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from uard.envs.locomotion.locomotion import ROOT, Kick, Locomotion
 from uard.envs.simulator import StepResult
 from uard.method import calibration
-from uard.method.mitigations import Evidence, Feedback, RatedReward
+from uard.method.mitigations import Evidence, Explanation, Feedback, RatedReward
 from uard.ratings.aggregate import nothing
 
 STEPS = 1000
@@ -30,6 +35,8 @@ EVERY = 10  # steps between two that are tried with a random action, too
 EPSILONS = np.linspace(0.0, 8.0, 17)
 THROWN = 1.0  # m, rad, m/s or rad/s, of one coordinate of a state that was never visited
 WORST = 0.75  # errors above this quantile are what sigma_m is to warn of
+COPIES, KICKED_AT, KICKED_STEPS = 16, 50, 150
+KICKS = (0.0, 1.0, 5.0)  # m/s; the paper's is the last
 
 CAUTION = RatedReward("bound")  # a static pessimist: mean - sd over the ratings and the observed reward
 
@@ -38,6 +45,7 @@ TRACE = ("observed", "adjusted", "caution", "lam", "true")
 PERTURBED = ("filtered", "raw", "sign_kept_filtered", "sign_kept_raw")
 WARNING = ("auroc_thrown", "auroc_error")
 REACTION = ("activations", "believed", "lambda_inside", "lambda_outside")
+KICKED = ("standing", "sigma_m", "sigma_h", "weight", "observed", "adjusted", "true")
 
 
 def inside() -> np.ndarray:
@@ -82,7 +90,9 @@ def examine(loop: Any, state: Any) -> dict[str, np.ndarray]:
         ``trace`` (STEPS, len(TRACE)) of the distorted walk; ``perturbed`` (len(EPSILONS), len(PERTURBED)): means over
         the states in which the agent's action is the better one; ``warning`` (len(WARNING),): chance that sigma_m is
         larger at a state thrown off by ``THROWN`` than at a visited one, and where the value is among the most wrong
-        quarter than elsewhere.
+        quarter than elsewhere. Of a robot also ``kicked`` (len(KICKS), KICKED_STEPS, len(KICKED)): the share of copies
+        that stand before the step, and means over them (0 where none does) of sigma_m after the step, and of its
+        sigma_h, weight, observed, adjusted and true reward.
     """
     reward_fn = _RewardFn(loop, state)
     own, rival = _walk(loop, state)
@@ -90,6 +100,8 @@ def examine(loop: Any, state: Any) -> dict[str, np.ndarray]:
     adjusted, caution, lam = reward_fn(own, observed)
     trace = np.column_stack([observed, adjusted, caution, lam, own.result.true_reward])
     found = {"trace": trace, "perturbed": _perturbed(reward_fn, own, rival), "warning": _warning(reward_fn, own)}
+    if isinstance(loop.job.environment, Locomotion):
+        found["kicked"] = np.stack([_kicked(reward_fn, size) for size in KICKS])
     return {name: value.astype(np.float32) for name, value in found.items()}
 
 
@@ -158,6 +170,11 @@ class _RewardFn:
 
     def __call__(self, steps: Walked, reward: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what the agent and a static pessimist would learn from steps so rewarded, and lambda_t; (B,) each."""
+        adjusted, caution, why = self.explain(steps, reward)
+        return adjusted, caution, np.zeros(len(reward)) + np.asarray(why.lam)
+
+    def explain(self, steps: Walked, reward: np.ndarray) -> tuple[np.ndarray, np.ndarray, Explanation]:
+        """Return the first two of these, and why the agent believes the reward as far as it does."""
         from uard.training.feedback import transition_model as transitions
 
         agent, mitigation, result = self.job.agent, self.job.mitigation, steps.result
@@ -174,7 +191,7 @@ class _RewardFn:
         caution = reward
         if self.job.asks_raters:
             caution = np.asarray(CAUTION.signal(evidence, statistics[CAUTION]).reward)
-        return adjusted, caution, np.zeros(len(reward)) + np.asarray(why.lam)
+        return adjusted, caution, why
 
     def _feedback(self, steps: Walked, reward: np.ndarray) -> Feedback:
         from uard.training.feedback import transition_model as transitions
@@ -220,3 +237,30 @@ def _warning(reward_fn: _RewardFn, own: Walked) -> np.ndarray:
     error = np.abs(value - earned - np.median(value - earned))
     wrong = error > np.quantile(error, WORST)
     return np.array([new, calibration.auroc(sigma, wrong) if wrong.any() else 0.5])
+
+
+def _kicked(reward_fn: _RewardFn, size: float) -> np.ndarray:
+    """Return what is found along an episode with a kick of some size, (KICKED_STEPS, len(KICKED))."""
+    from uard.training.host import loop as host
+
+    job, loop, state = reward_fn.job, reward_fn.loop, reward_fn.state
+    forward = job.environment.actions + ROOT - 1
+    kicked = replace(job.environment, kick=Kick(KICKED_AT, size, forward))
+    simulator = kicked.simulator(COPIES, int(host.generator(job.seed, host.EVALUATION, 3).integers(2**63)))
+    steps: list[Walked] = []
+    for _ in range(KICKED_STEPS):
+        here = simulator.observe()
+        action = np.clip(loop.act(state, here), -1.0, 1.0)
+        steps.append(Walked(here, action, simulator.step(action)))
+    simulator.close()
+    all_steps = _joined(steps)
+    result = all_steps.result
+    ended = (result.terminated | result.truncated).reshape(KICKED_STEPS, COPIES)
+    standing = np.cumsum(ended, 0) - ended == 0  # an episode that follows upon a fall was not kicked
+    adjusted, _, why = reward_fn.explain(all_steps, result.reward)
+    sigma_m = reward_fn.doubt(result.observation)
+    columns = (sigma_m, why.sigma_h, why.weight, result.reward, adjusted, result.true_reward)
+    several = np.stack([np.broadcast_to(np.asarray(c, float), sigma_m.shape) for c in columns], -1)
+    several = several.reshape(KICKED_STEPS, COPIES, len(columns))
+    means = (several * standing[..., None]).sum(1) / np.maximum(standing.sum(1), 1)[:, None]
+    return np.column_stack([standing.mean(1), means])

@@ -31,6 +31,8 @@ def losses(data: Mapping[str, Any]) -> list[str]:
         for c in data["curves"]:
             for n in SHOWN:
                 i = data["n"].index(n)
+                if c["over_uard"]["ci95"][i] is None:  # one seed
+                    continue
                 low, high = c["over_uard"]["ci95"][i]
                 if c["panel"] == panel and low > 0:
                     more = f"{c['over_uard']['mean'][i]:+.3f} [{low:+.3f}, {high:+.3f}]"
@@ -55,8 +57,9 @@ def table(data: Mapping[str, Any]) -> Table:
         cells = []
         for n in SHOWN:
             i = data["n"].index(n)
-            low, high = c["gold"]["ci95"][i]
-            cells.append(f"{c['gold']['mean'][i]:.2f} [{low:.2f}, {high:.2f}]")
+            ends = c["gold"]["ci95"][i]
+            shown = f"[{ends[0]:.2f}, {ends[1]:.2f}]" if ends else "(one run)"
+            cells.append(f"{c['gold']['mean'][i]:.2f} {shown}")
         rows.append((c["panel"], c["method"], *cells))
     return Table(
         "Best-of-n: what the chosen answer is worth in gold",
@@ -82,7 +85,7 @@ def figure(data: Mapping[str, Any]) -> Figure:
             colour = COLOURS[c["method"]]
             axis.plot(data["kl"], c["gold"]["mean"], color=colour, lw=2.2 if ours else 1.5, label=c["method"])
             axis.plot(data["kl"], c["proxy"]["mean"], color=colour, lw=1, ls=":")
-            if ours:
+            if ours and all(c["gold"]["ci95"]):
                 low, high = np.transpose(c["gold"]["ci95"])
                 axis.fill_between(data["kl"], low, high, color=colour, alpha=0.15, lw=0)
         axis.set(xlabel="KL = log n - (n - 1) / n", title=f"{panel} reward models")

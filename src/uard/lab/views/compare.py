@@ -271,6 +271,11 @@ def lines(comparison: Comparison) -> list[str]:
             f"{len(differ)} cells differ, {worse} of them by more than seed noise (swap test over seeds, corrected for "
             f"all cells and metrics, level {LEVEL:g})"
         )
+        tested = [e for c in differ for e in c.effects] + list(comparison.everywhere)
+        found.append(
+            f"{len(tested)} comparisons: {LEVEL * len(tested):.1f} would differ by chance at 5 % uncorrected, "
+            f"{sum(e.differs for e in tested)} do after correction"
+        )
     if comparison.least_p >= LEVEL:
         found.append(
             f"with so few seeds p cannot be below {comparison.least_p:.3g}: no difference could have been found; 6 "

@@ -7,6 +7,7 @@ import io
 from typing import Any
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -69,8 +70,7 @@ def competition(results: StudyResults) -> Figure:
             axis.plot(range(len(noises)), [x.mean for x in s], "o-", color=COLOURS[name], lw=2, label=name)
             axis.fill_between(
                 range(len(noises)),
-                [x.ci95[0] for x in s],
-                [x.ci95[1] for x in s],
+                *np.transpose([x.ci95 or (x.mean, x.mean) for x in s]),
                 color=COLOURS[name],
                 alpha=0.15,
                 lw=0,

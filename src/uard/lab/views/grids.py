@@ -6,7 +6,6 @@ import numpy as np
 
 from uard.lab import statistics
 from uard.lab.result import CALIBRATION
-from uard.lab.statistics import Summary
 from uard.lab.study import Row
 from uard.lab.views import figures
 from uard.lab.views.study_results import StudyResults
@@ -34,18 +33,24 @@ def _colluding(results: StudyResults) -> str:
 
 def _escaped(results: StudyResults) -> str:
     """Say who escapes colluding raters, and where most."""
-    gains = []
-    for r in results.studies["matrix"].where(panel="colluding"):
-        mine = results.row("matrix", **(dict(r.labels) | {"mitigation": "uard"})).cell
-        if r["mitigation"] != "uard" and _better(results.of(r.cell, "true_return"), results.of(mine, "true_return")):
-            gains.append((results.of(r.cell, "true_return").mean - results.of(mine, "true_return").mean, r, mine))
+    pairs = [
+        (r, results.row("matrix", **(dict(r.labels) | {"mitigation": "uard"})).cell)
+        for r in results.studies["matrix"].where(panel="colluding")
+        if r["mitigation"] != "uard"
+    ]
+    family = results.compare([(r.cell, mine) for r, mine in pairs], "true_return")
+    gains = [
+        (results.of(r.cell, "true_return").mean - results.of(mine, "true_return").mean, r, mine)
+        for i, (r, mine) in enumerate(pairs)
+        if family.above(i)
+    ]
     if not gains:
-        return ""
+        return family.caption()
     _, best, mine = max(gains, key=lambda g: g[0])
     return (
         f"In {len(gains)} comparisons another mitigation does better there, most of all {best['mitigation']} ({_name(best)}): "
         f"{brief(results.of(best.cell, 'true_return'))} against {brief(results.of(mine, 'true_return'))}; very noisy raters make it shun "
-        "whatever they rate."
+        f"whatever they rate. Rival against uard: {family.caption()}"
     )
 
 
@@ -69,16 +74,17 @@ def _missed(results: StudyResults) -> str:
 
 def _denied(results: StudyResults) -> str:
     """One rater of several who denies the goal: where `uard` loses it, and who does not."""
+    ours = list(results.studies["dissent"].where(mitigation="uard"))
+    pairs = [(x, r) for r in ours for x in results.studies["dissent"].where(panel=r["panel"]) if x is not r]
+    family = results.compare([(x.cell, r.cell) for x, r in pairs], "success_rate")
     lost = []
-    for r in results.studies["dissent"].where(mitigation="uard"):
-        mine = results.of(r.cell, "success_rate")
-        rivals = results.studies["dissent"].where(panel=r["panel"])
-        better = [x["mitigation"] for x in rivals if _better(results.of(x.cell, "success_rate"), mine)]
+    for r in ours:
+        better = [x["mitigation"] for i, (x, mine) in enumerate(pairs) if mine is r and family.above(i)]
         if better:
-            lost.append(f"{r['panel']}: {brief(mine)}, more with {', '.join(better)}")
-    count = len(list(results.studies["dissent"].where(mitigation="uard")))
+            lost.append(f"{r['panel']}: {brief(results.of(r.cell, 'success_rate'))}, more with {', '.join(better)}")
+    count = len(ours)
     named = f" (share of episodes that reach it: {'; '.join(lost)})" if lost else ""
-    return f"One rater against all others takes the goal from uard in {len(lost)} of {count} settings{named}."
+    return f"One rater against all others takes the goal from uard in {len(lost)} of {count} settings{named}. Rival against uard: {family.caption()}"
 
 
 def _learned(results: StudyResults) -> str:
@@ -96,19 +102,24 @@ def _learned(results: StudyResults) -> str:
 
 def _beaten(results: StudyResults, study: str, shown: tuple[str, ...]) -> str:
     """Every setting of a study in which another mitigation has the higher true return."""
-    beaten = []
     rows = [r for r in results.studies[study].where(mitigation="uard") if r["panel"] != "colluding"]
-    for r in rows:
-        labels = {k: r[k] for k in shown}
-        mine = results.of(r.cell, "true_return")
-        for rival in results.studies[study].where(**labels):
-            if rival["mitigation"] != "uard" and _better(theirs := results.of(rival.cell, "true_return"), mine):
-                where = ", ".join(f"{k} {v:g}" if isinstance(v, float) else f"{k} {v}" for k, v in labels.items())
-                beaten.append(f"{where}: {rival['mitigation']} {brief(theirs)} against {brief(mine)}")
+    pairs = [
+        (rival, r)
+        for r in rows
+        for rival in results.studies[study].where(**{k: r[k] for k in shown})
+        if rival["mitigation"] != "uard"
+    ]
+    family = results.compare([(rival.cell, r.cell) for rival, r in pairs], "true_return")
+    beaten = []
+    for i, (rival, r) in enumerate(pairs):
+        if family.above(i):
+            where = ", ".join(f"{k} {r[k]:g}" if isinstance(r[k], float) else f"{k} {r[k]}" for k in shown)
+            theirs, mine = (brief(results.of(x.cell, "true_return")) for x in (rival, r))
+            beaten.append(f"{where}: {rival['mitigation']} {theirs} against {mine}")
     named = ": " + "; ".join(beaten) if beaten else ""
     return (
         f"Study {study}: in {len(beaten)} comparisons over {len(rows)} settings another mitigation has the higher true "
-        f"return (95 % intervals apart){named}."
+        f"return{named}. Rival against uard: {family.caption()}"
     )
 
 
@@ -128,10 +139,6 @@ def _rankings(results: StudyResults) -> list[str]:
                 f"10x10, {panel} panel, noise sd {noise:g}: highest true return {first} {full(best)}, then {runner} {full(second)}."
             )
     return out
-
-
-def _better(a: Summary, b: Summary) -> bool:
-    return a.ci95[0] > b.ci95[1]
 
 
 def _name(r: Row) -> str:

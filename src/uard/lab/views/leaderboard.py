@@ -7,8 +7,9 @@ study nor, if a package brought it, that package.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +32,11 @@ HONEST, OWN, COLLUDING, TWIN = "honest raters", "panels without a name", "collud
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over seeds and its 95 % bootstrap interval."""
+    """A mean over seeds, its 95 % interval (``statistics.interval``; None for one seed), and the values by seed."""
 
     mean: float
-    low: float
-    high: float
-
-    def above(self, other: Estimate) -> bool:
-        """Whether it is larger and the intervals are apart."""
-        return self.low > other.high
+    ci95: statistics.Interval | None
+    values: Mapping[int, float]
 
 
 @dataclass(frozen=True)
@@ -98,7 +95,7 @@ class Standing:
     Attributes:
         mitigation: Its name.
         settings: Lines with honest raters.
-        tamer: Settings in which it hacks less than the raw agent (intervals apart).
+        tamer: Settings in which it hacks less than the raw agent (after Holm correction).
         richer: In which its true return is higher than the raw agent's.
         poorer: In which its true return is lower than the raw agent's.
         unbeaten: In which no other mitigation has a higher true return, of those with rivals.
@@ -123,8 +120,8 @@ def lines(store: Store) -> list[Line]:
     cells = store.cells()
     known = _Names([cell.config for cell in cells])
     seeds = [cell.metrics for cell in cells]
-    rates = [[m["hacks"] / m["episode_length"] for m in s.values()] for s in seeds]
-    both = _estimates(rates + [[m["true_return"] for m in s.values()] for s in seeds])
+    rates = [{i: m["hacks"] / m["episode_length"] for i, m in s.items()} for s in seeds]
+    both = _estimates(rates + [{i: m["true_return"] for i, m in s.items()} for s in seeds])
     hacks, true = both[: len(cells)], both[len(cells) :]
     made = [_line(c.config, known, len(c.metrics), c.failed, h, t) for c, h, t in zip(cells, hacks, true, strict=True)]
     return sorted(made, key=lambda x: (*x.setting, -x.true.mean if x.true else np.inf, x.mitigation))
@@ -132,28 +129,21 @@ def lines(store: Store) -> list[Line]:
 
 def standings(these: Sequence[Line]) -> list[Standing]:
     """Sum the lines up by mitigation, the one that is unbeaten in most settings first."""
-    raw: dict[Any, Any] = {x.place: x for x in these if x.mitigation == RAW and x.compared}
-    rivals: dict[Any, list[Any]] = defaultdict(list)
     of: dict[str, list[Line]] = defaultdict(list)
     for x in these:
         of[x.mitigation].append(x)
-        if x.compared and x.mitigation != RAW:
-            rivals[x.setting].append(x)
-    best = {setting: max(x.true.low for x in some) for setting, some in rivals.items()}
+    raw, rivals, _, larger = _tested(these)
 
-    def against_raw(some: Iterable[Line], better: Any) -> tuple[int, int]:
+    def against_raw(some: Iterable[Line], metric: str, sign: int) -> tuple[int, int]:
         pairs = [(x, raw[x.place]) for x in some if x.compared and x.mitigation != RAW and x.place in raw]
-        return sum(better(x, r) for x, r in pairs), len(pairs)
+        return sum(larger[metric, id(x), id(r)] == sign for x, r in pairs), len(pairs)
 
-    def unbeaten(some: Iterable[Any]) -> tuple[int, int]:
+    def unbeaten(some: Iterable[Line]) -> tuple[int, int]:
         won = []
-        for x in (x for x in some if x.compared):
-            base = raw.get(x.place)
-            others = len(rivals[x.setting]) - (x.mitigation != RAW) + (base is not None and base is not x)
+        for x in (x for x in some if x.compared and x.mitigation != RAW):
+            others = [y for y in (*rivals[x.setting], raw.get(x.place)) if y is not None and y is not x]
             if others:
-                # Its own low, which is among these, is never above its high.
-                highest = max(best.get(x.setting, -np.inf), base.true.low if base else -np.inf)
-                won.append(x.true.high >= highest)
+                won.append(all(larger["true", id(x), id(y)] >= 0 for y in others))
         return sum(won), len(won)
 
     out = []
@@ -163,16 +153,51 @@ def standings(these: Sequence[Line]) -> list[Standing]:
             Standing(
                 mitigation,
                 len(honest),
-                against_raw(honest, lambda x, r: r.hacks.above(x.hacks)),
-                against_raw(honest, lambda x, r: x.true.above(r.true)),
-                against_raw(honest, lambda x, r: r.true.above(x.true)),
+                against_raw(honest, "hacks", -1),
+                against_raw(honest, "true", 1),
+                against_raw(honest, "true", -1),
                 unbeaten(honest),
-                against_raw(fooled, lambda x, r: r.hacks.above(x.hacks)),
-                against_raw(twins, lambda x, r: r.true.above(x.true)),
+                against_raw(fooled, "hacks", -1),
+                against_raw(twins, "true", -1),
                 sum(x.failed for x in every),
             )
         )
     return sorted(out, key=lambda s: (-s.unbeaten[0], -s.settings, s.mitigation))
+
+
+def caption(these: Sequence[Line]) -> str:
+    """Say how many comparisons the standings rest on, and how many differ by chance and after correction."""
+    return _tested(these)[2].caption()
+
+
+def _tested(
+    these: Sequence[Line],
+) -> tuple[dict[Any, Line], dict[Any, list[Line]], statistics.Family, dict[tuple[str, int, int], int]]:
+    """Return the raw line of each place, the others of each setting, their tests, and who is larger (+1), smaller (-1).
+
+    All comparisons of the page are one family: with raw, and of each two mitigations of a setting with honest raters.
+    """
+    raw = {x.place: x for x in these if x.mitigation == RAW and x.compared}
+    rivals: dict[Any, list[Line]] = defaultdict(list)
+    for x in these:
+        if x.compared and x.mitigation != RAW:
+            rivals[x.setting].append(x)
+    pairs = [
+        (m, x, raw[x.place]) for some in rivals.values() for x in some if x.place in raw for m in ("hacks", "true")
+    ]
+    pairs += [("true", x, y) for some in rivals.values() if some[0].control == HONEST for x, y in combinations(some, 2)]
+    family = statistics.compare_all(_paired(getattr(x, m).values, getattr(y, m).values) for m, x, y in pairs)
+    larger: dict[tuple[str, int, int], int] = {}
+    for i, (metric, x, y) in enumerate(pairs):
+        sign = family.above(i) - family.below(i)
+        larger[metric, id(x), id(y)], larger[metric, id(y), id(x)] = sign, -sign
+    return raw, rivals, family, larger
+
+
+def _paired(a: Mapping[int, float], b: Mapping[int, float]) -> tuple[list[float], list[float]]:
+    """Return the numbers of the seeds that both have; all of both where that is fewer than two."""
+    shared = sorted(a.keys() & b.keys())
+    return ([a[s] for s in shared], [b[s] for s in shared]) if len(shared) > 1 else ([*a.values()], [*b.values()])
 
 
 def share(pair: tuple[int, int]) -> float:
@@ -194,6 +219,7 @@ def write(target: Path, store: Store) -> Path:
         HERE,
         "leaderboard.html.j2",
         number=number,
+        compared=caption(these),
         share=share,
         version=__version__,
         named=[s for s in every if ", " not in s.mitigation],
@@ -211,13 +237,15 @@ def write(target: Path, store: Store) -> Path:
     return target
 
 
-def _estimates(values: list[list[float]]) -> list[Estimate | None]:
+def _estimates(values: list[dict[int, float]]) -> list[Estimate | None]:
     out: list[Estimate | None] = [None] * len(values)
     for size in {len(v) for v in values} - {0}:
         places = [i for i, v in enumerate(values) if len(v) == size]
-        sample = np.array([values[i] for i in places])
-        for i, mean, (low, high) in zip(places, sample.mean(1), statistics.intervals(sample), strict=True):
-            out[i] = Estimate(float(mean), float(low), float(high))
+        sample = np.array([[*values[i].values()] for i in places])
+        ends = statistics.intervals(sample) if size > 1 else [None] * len(places)
+        for i, mean, interval in zip(places, sample.mean(1), ends, strict=True):
+            ci95 = None if interval is None else (float(interval[0]), float(interval[1]))
+            out[i] = Estimate(float(mean), ci95, values[i])
     return out
 
 

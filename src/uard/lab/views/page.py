@@ -19,7 +19,7 @@ from uard._support import files
 from uard.lab import studies
 from uard.lab.execution.store import Store
 from uard.lab.result import WINDOW
-from uard.lab.views import best_of_n, figures, games, grids, leaderboard, published, sections
+from uard.lab.views import best_of_n, figures, games, grids, leaderboard, panels, published, sections
 from uard.lab.views.sections import Section
 from uard.lab.views.study_results import StudyResults
 from uard.lab.views.tables import study_table
@@ -49,27 +49,44 @@ def write(
         LookupError: a study is not finished.
     """
     results = StudyResults(store, seeds, studies.find(("grid",), mitigations))
-    ours = [_ours(results), _games(), _best_of_n(), _made(store, len(results.seeds))]
+    ours = [_ours(results), *_panels(), _games(), _best_of_n(), _made(store, len(results.seeds))]
     theirs, broken = sections.of_packages(results, [*ours, _losses(())])
     every = sorted([*ours, *theirs], key=lambda s: s.order)
-    every = sorted([*every, _losses(every)], key=lambda s: s.order)
+    page = write_page(folder, [*every, _losses(every)], len(results.seeds), [(_LEADERBOARD, "leaderboard.html")])
+    leaderboard.write(folder / "leaderboard.html", store)
+    return page, broken
+
+
+def write_page(folder: Path, every: Sequence[Section], seeds: int, others: Sequence[tuple[float, str]] = ()) -> Path:
+    """Write ``index.html`` and the files of some sections into a folder; return the page.
+
+    Args:
+        folder: Made if it is not there.
+        every: The sections.
+        seeds: Of every cell.
+        others: Pages that are written beside it, by their places among the links.
+
+    Raises:
+        InvalidValueError: the folder cannot be written.
+    """
+    every = sorted(every, key=lambda s: s.order)
     links = [(s.order, f"#{s.id}", s.label or s.title) for s in every]
+    links += [(order, name, name.removesuffix(".html").capitalize()) for order, name in others]
     page = render(
         HERE,
         "page.html.j2",
         version=__version__,
-        seeds=len(results.seeds),
+        seeds=seeds,
         window=WINDOW,
         sections=every,
         programs=[f"{{\n{s.js}\n}}" for s in every if s.js],
-        links=[link for _, *link in sorted([*links, (_LEADERBOARD, "leaderboard.html", "Leaderboard")])],
+        links=[link for _, *link in sorted(links)],
     )
     files.prepare_folder(folder, "report")
     for name, text in ((name, text) for section in every for name, text in section.files.items()):
         files.write(folder / name, text, "report")
     files.write(folder / "index.html", page, "report")
-    leaderboard.write(folder / "leaderboard.html", store)
-    return folder / "index.html", broken
+    return folder / "index.html"
 
 
 def _losses(every: Sequence[Section]) -> Section:
@@ -88,6 +105,15 @@ def _ours(results: StudyResults) -> Section:
     return Section(
         "ours", "Every mitigation, everywhere", 60, html, "Every mitigation", losses=tuple(grids.losses(results))
     )
+
+
+def _panels() -> list[Section]:
+    """Return what was published of the study of random panels; nothing if it is not whole: it is the headline."""
+    results = published.packaged()
+    (study,) = studies.find(("panels",))
+    if not all(map(results.has, study.rows)):
+        return []
+    return [panels.section(study, panels.regrets(study, results.per_seed), results.seeds(study.name))]
 
 
 def _games() -> Section:

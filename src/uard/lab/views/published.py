@@ -1,9 +1,10 @@
 """Results that are published with the package: studies too long to be trained for every report.
 
 ``uard reproduce STUDIES --extract FILE`` writes what the report needs of finished studies as one small JSON file:
-metrics per seed, binned curves, what was derived from tables, and how it was made. The report reads the packaged ones;
-a row that is not in them, or whose configuration has changed since (its key then differs), is shown as missing, never
-guessed. Here with a store that is filled by hand:
+metrics per seed, binned curves, what was derived from tables, and how it was made; of a study with thousands of cells
+no more than the metrics that it names (``Study.brief``). The report reads the packaged ones; a row that is not in them,
+or whose configuration has changed since (its key then differs), is shown as missing, never guessed. Here with a store
+that is filled by hand:
 
     >>> cell, store = Cell(episodes=20), Store(":memory:")
     >>> study = Study("mine", "Without a mitigation", "", (Row((("mitigation", "raw"),), cell),), curves=("hacks",))
@@ -33,7 +34,7 @@ from uard.lab import statistics
 from uard.lab.cell import Cell
 from uard.lab.config import FORMAT
 from uard.lab.execution.store import Store
-from uard.lab.result import Result, check_name
+from uard.lab.result import SHARES, Result, check_name
 from uard.lab.statistics import Summary
 from uard.lab.study import Row, Study
 from uard.plugins import Plugin, PluginError, brought
@@ -80,7 +81,10 @@ def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], comman
         for r in study.rows:
             wanted.setdefault(r.cell, {})[study.name] = study
     cells: dict[str, Any] = {}
+    in_brief = {cell for cell, theirs in wanted.items() if all(s.brief for s in theirs.values())}
     for cell, theirs in wanted.items():
+        if cell in in_brief:
+            continue
         found = store.get(cell, seeds)
         if len(found) == len(seeds):
             cells[cell.key] = _of_cell(theirs.values(), cell, found)
@@ -93,7 +97,20 @@ def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], comman
         "packages": {p: metadata.version(p) for p in packages} | {"python": platform.python_version()},
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "cells": cells,
-    }
+    } | ({"brief": _brief(wanted, in_brief, store, seeds)} if in_brief else {})
+
+
+def _brief(
+    wanted: Mapping[Cell, Mapping[str, Study]], in_brief: Iterable[Cell], store: Store, seeds: Sequence[int]
+) -> dict[str, Any]:
+    """Return some metrics of many cells in a tenth of the room, without their configurations."""
+    names = list(dict.fromkeys(m for cell in in_brief for s in wanted[cell].values() for m in s.brief))
+    cells = {}
+    for cell in (c for c in wanted if c in in_brief):
+        found = store.metrics(cell, seeds)
+        if len(found) == len(seeds):
+            cells[cell.key] = [_short([found[s][m] for s in sorted(found)], digits=4) for m in names]
+    return {"seeds": sorted(seeds), "metrics": names, "cells": cells}
 
 
 def _checkout() -> str | None:
@@ -127,13 +144,13 @@ def _of_cell(studies: Iterable[Study], cell: Cell, found: Mapping[int, Result]) 
     return out | ({"derived": _short(derived)} if derived else {})
 
 
-def _short(x: Any) -> Any:
-    """Return numbers, however nested, as JSON has them, with six significant digits."""
+def _short(x: Any, digits: int = 6) -> Any:
+    """Return numbers, however nested, as JSON has them, with so many significant digits."""
     if isinstance(x, Mapping):
-        return {name: _short(value) for name, value in x.items()}
+        return {name: _short(value, digits) for name, value in x.items()}
     if isinstance(x, list | tuple | np.ndarray):
-        return [_short(value) for value in x]
-    return int(x) if isinstance(x, int | np.integer) else float(f"{float(x):.6g}")
+        return [_short(value, digits) for value in x]
+    return int(x) if isinstance(x, int | np.integer) else float(f"{float(x):.{digits}g}")
 
 
 def _binned(curve: np.ndarray) -> np.ndarray:
@@ -166,22 +183,23 @@ class Published:
             InvalidValueError: something of another format of keys, or that is no published results.
         """
         self.studies = {s.name: s for s in studies}
-        self.sources = [{k: v for k, v in f.items() if k != "cells"} for f in files]
+        self.sources: list[dict[str, Any]] = []
         self._cells: dict[str, Any] = {}
         for f in files:
+            _checks.instance("published", f, dict, "what `uard reproduce --extract` wrote")
             if _format_of(f) != FORMAT:
                 raise _checks.InvalidValueError("format", _format_of(f), f"{FORMAT}: {MIGRATE}")
-            check_cells(f)
-            self._cells |= f["cells"]
+            self._cells |= cells_of(f)
+            self.sources.append({k: v for k, v in f.items() if k not in ("cells", "brief")})
 
     @property
     def cells(self) -> tuple[str, ...]:
         """Return the keys of all published cells."""
         return tuple(self._cells)
 
-    def has(self, row: Row) -> bool:
-        """Whether a row was published."""
-        return row.cell.key in self._cells
+    def has(self, row: Row, derived: str = "") -> bool:
+        """Whether a row was published, and, if a name is given, this derived from it."""
+        return row.cell.key in self._cells and (not derived or derived in self._cell(row).get("derived", {}))
 
     def rows(self, study: str, **labels: Any) -> list[Row]:
         """Return the published rows of a study with these labels."""
@@ -209,7 +227,19 @@ class Published:
 
     def of(self, row: Row, metric: str) -> Summary:
         """Return a metric's summary."""
-        return statistics.summarise(self.per_seed(row, metric), metric)
+        return statistics.summarise(self.per_seed(row, metric), metric, metric in SHARES)
+
+    def compare(self, pairs: Sequence[tuple[Row, Row]], metric: str) -> statistics.Family:
+        """Test a metric of each pair of rows on the seeds that both have, paired; corrected for the number of pairs."""
+        found = []
+        for rows in pairs:
+            one, other = (dict(zip(self.seeds_of(r), self.per_seed(r, metric), strict=True)) for r in rows)
+            shared = [seed for seed in one if seed in other]
+            if len(shared) < 2:  # with seeds of their own they are compared as they are
+                found.append((list(one.values()), list(other.values())))
+            else:
+                found.append(([one[s] for s in shared], [other[s] for s in shared]))
+        return statistics.compare_all(found)
 
     def per_seed(self, row: Row, metric: str) -> np.ndarray:
         """Return a metric, one number per seed."""
@@ -233,6 +263,53 @@ class Published:
     def derived(self, row: Row, name: str) -> np.ndarray:
         """Return something derived, one entry per seed."""
         return self._numbers(row, "derived", name)
+
+
+def read_file(path: str) -> Any:
+    """Return what ``uard reproduce --extract`` wrote.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     _ = Path(folder, "mine.json").write_text('{"cells": {}}')
+        ...     read_file(f"{folder}/mine.json")
+        {'cells': {}}
+
+    Raises:
+        InvalidValueError: it cannot be read.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        allowed = f"a file that `uard reproduce --extract` wrote ({error})"
+        raise _checks.InvalidValueError("published", path, allowed) from None
+
+
+def cells_of(data: Any) -> dict[str, Any]:
+    """Return the cells of what ``extract`` gave by key, those in brief written out.
+
+    Examples:
+        >>> brief = {"seeds": [0, 1], "metrics": ["hacks"], "cells": {"a": [[1.0, 2.0]]}}
+        >>> cells_of({"cells": {}, "brief": brief})
+        {'a': {'seeds': [0, 1], 'metrics': {'hacks': [1.0, 2.0]}}}
+
+    Raises:
+        InvalidValueError: see ``check_cells``; of what is in brief, metrics and cells do not fit together.
+    """
+    check_cells(data)
+    if "brief" not in data:
+        return data["cells"]
+    brief = _checks.instance("brief", data["brief"], dict, "an object")
+    for name, kind, allowed in (("seeds", list, "a list"), ("metrics", list, "a list"), ("cells", dict, "an object")):
+        _checks.instance(f"brief.{name}", brief.get(name), kind, allowed)
+    written_out = {}
+    for key, values in brief["cells"].items():
+        if not isinstance(values, list) or len(values) != len(brief["metrics"]):
+            allowed = f"a list for each of {len(brief['metrics'])} metrics"
+            raise _checks.InvalidValueError(f"brief.cells[{key}]", values, allowed)
+        written_out[key] = {"seeds": brief["seeds"], "metrics": dict(zip(brief["metrics"], values, strict=True))}
+    check_cells({"cells": written_out})
+    return data["cells"] | written_out
 
 
 def check_cells(data: Any) -> None:
@@ -299,7 +376,7 @@ def broken() -> list[PluginError]:
     return brought("results", _checked)[1]
 
 
-_OWN = ResultFiles(resources.files("uard.lab.published"), ("games.json",))
+_OWN = ResultFiles(resources.files("uard.lab.published"), ("games.json",))  # and panels.json, once it is there
 
 
 def _places() -> list[ResultFiles]:
@@ -320,7 +397,7 @@ def _checked(plugin: Plugin) -> ResultFiles:
     made = _called(plugin)
     for name in made.studies:
         try:
-            check_cells(_read(made, name))
+            cells_of(_read(made, name))
         except ValueError as error:  # of JSON, too
             raise PluginError(plugin, f"{name} is no published results: {error}") from None
         if (found := _format_of(_read(made, name))) != FORMAT:

@@ -11,7 +11,7 @@ from uard import _checks
 from uard.lab import statistics
 from uard.lab.cell import Cell
 from uard.lab.execution.store import Store
-from uard.lab.result import METRICS, Result, check_name
+from uard.lab.result import METRICS, SHARES, Result, check_name
 from uard.lab.study import Row, Study, metrics_of, results_of
 
 
@@ -57,8 +57,12 @@ class StudyResults:
         """Return one metric's summary."""
         key = cell, metric
         if key not in self._summaries:
-            self._summaries[key] = statistics.summarise(self.values(cell, metric), metric)
+            self._summaries[key] = statistics.summarise(self.values(cell, metric), metric, metric in SHARES)
         return self._summaries[key]
+
+    def compare(self, pairs: Sequence[tuple[Cell, Cell]], metric: str) -> statistics.Family:
+        """Test a metric of each pair of cells, paired by seed; corrected for the number of pairs."""
+        return statistics.compare_all((self.values(a, metric), self.values(b, metric)) for a, b in pairs)
 
     def moments(self, cell: Cell, metric: str) -> tuple[float, float]:
         """Return mean and sd of one metric as its summary does, but at once: no interval is resampled."""
@@ -97,4 +101,4 @@ class StudyResults:
         curves = self.curves(study, column, **labels)
         _checks.whole("last", last, low=1, high=curves.shape[1])
         _checks.whole("first", first, low=1, high=last)
-        return statistics.summarise(curves[:, first - 1 : last].mean(1), column)
+        return statistics.summarise(curves[:, first - 1 : last].mean(1), column, column == "success")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from uard.lab.statistics import Summary
+from uard.lab.statistics import Interval, Summary
 from uard.lab.study import Study
 from uard.lab.views.study_results import StudyResults
 
@@ -39,8 +39,8 @@ def number(x: float) -> str:
 
 
 def brief(s: Summary) -> str:
-    """Mean +- sd."""
-    return mean_sd(s.mean, s.sd)
+    """Mean +- sd; of one seed its value, and that it is one run."""
+    return mean_sd(s.mean, s.sd) if len(s.per_seed) > 1 else f"{number(s.mean)} (one run)"
 
 
 def mean_sd(mean: float, sd: float) -> str:
@@ -49,8 +49,13 @@ def mean_sd(mean: float, sd: float) -> str:
 
 
 def full(s: Summary) -> str:
-    """Mean +- sd [95 % interval of the mean]."""
-    return f"{brief(s)} [{number(s.ci95[0])}, {number(s.ci95[1])}]"
+    """Mean +- sd [95 % interval of the mean]; one seed has none."""
+    return f"{brief(s)}{bounds(s.ci95)}"
+
+
+def bounds(interval: Interval | None) -> str:
+    """Return an interval in brackets after a space; nothing if there is none."""
+    return "" if interval is None else f" [{number(interval[0])}, {number(interval[1])}]"
 
 
 def study_table(study: Study, results: StudyResults) -> Table:
@@ -58,7 +63,8 @@ def study_table(study: Study, results: StudyResults) -> Table:
     names = tuple(name for name, _ in study.rows[0].labels)
     rows = []
     for r in study.rows:
-        metrics = tuple(mean_sd(*results.moments(r.cell, m)) for m in SHOWN)
+        moments = (results.moments(r.cell, m) for m in SHOWN)
+        metrics = tuple(mean_sd(*x) if len(results.seeds) > 1 else f"{number(x[0])} (one run)" for x in moments)
         rows.append((*(str(v) for _, v in r.labels), *metrics))
     columns = (*names, *(m.replace("_", " ") for m in SHOWN))
     return Table(

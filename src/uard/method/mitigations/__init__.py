@@ -8,6 +8,7 @@ from uard.method.mitigations.pooled import PooledDiscounting, uard
 from uard.method.mitigations.protocol import Backup, Evidence, Explanation, LearningSignal, Mitigation
 from uard.method.mitigations.registry import NAMED, fault, named
 from uard.method.mitigations.robust import ExcessDisagreement, RaterCap
+from uard.method.mitigations.witness import Witness
 
 __all__ = [
     "NAMED",
@@ -27,6 +28,7 @@ __all__ = [
     "RewardDiscounting",
     "Screening",
     "TrueReward",
+    "Witness",
     "fault",
     "named",
     "uard",

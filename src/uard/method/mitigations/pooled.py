@@ -10,7 +10,7 @@ from uard.method import pooled, rater_statistics
 from uard.method.arrays import Array, namespace
 from uard.method.feedback import ByRater, Feedback
 from uard.method.mitigations.protocol import Evidence, Explanation, LearningSignal, Mitigation
-from uard.method.mitigations.robust import each_rater, fit_raters
+from uard.method.mitigations.robust import each_rater, flattened
 from uard.method.rater_statistics import RaterStatistics, masked_median
 
 if TYPE_CHECKING:
@@ -53,7 +53,9 @@ class PooledDiscounting(Mitigation):
         contest: How many tau the anchor lies below the pooled mean, >= 0.
         caution: How many standard errors of the pooled mean it lies below that, >= 0.
         risk: Premium >= 0 for not knowing which hypothesis holds, in posterior standard deviations.
-        unrated_weight: How far an extraordinary reward is believed that nobody has rated, in [0, 1].
+        unrated_weight: How far an extraordinary reward is believed that nobody has rated, in [0, 1]. A higher one
+            explores more: better on random problems whose raters answer seldom (development regret .09 at 0.05, .05
+            at 1), but with 0.4 an agent on the paper's 10x10 grid no longer reaches the goal at 1 % rated steps.
         vetoes: How many lone low dissenters may be overruled, see ``uard.method.pooled.overruled``; >= 0.
     """
 
@@ -84,11 +86,10 @@ class PooledDiscounting(Mitigation):
 
     def fit(self, feedback: Feedback, rated: Bool[Array, "*batch"]) -> Believed:
         """Measure the raters, and what is usual."""
-        raters = fit_raters(feedback, rated)
-        r = feedback.proxy
-        learned = self._learned(r, each_rater(feedback), 0.0 * r, Believed(raters, 0.0 * raters.scale))[0]
-        xp = namespace(learned)
-        return Believed(raters, masked_median(xp.reshape(learned, (-1,)), xp.reshape(rated, (-1,))))
+        r, each, rated = rater_statistics.thinned(*flattened(feedback, rated))
+        raters = rater_statistics.fit(r, each, rated)
+        learned = self._learned(r, each, 0.0 * r, Believed(raters, 0.0 * raters.scale))[0]
+        return Believed(raters, masked_median(learned, rated))
 
     def signal(self, evidence: Evidence, statistics: Believed) -> LearningSignal:
         """Return what is learned."""

@@ -12,6 +12,7 @@ from uard.method.mitigations.discounting import uard_0_1, uard_paper
 from uard.method.mitigations.pooled import uard
 from uard.method.mitigations.protocol import Mitigation
 from uard.method.mitigations.robust import ExcessDisagreement, RaterCap
+from uard.method.mitigations.witness import Witness
 
 NAMED: dict[str, Callable[..., Mitigation]] = {
     "raw": Raw,
@@ -22,6 +23,7 @@ NAMED: dict[str, Callable[..., Mitigation]] = {
     "min-proxy-mean": partial(RaterCap, statistic="mean"),
     "min-proxy-median": RaterCap,
     "excess": ExcessDisagreement,
+    "witness": Witness,
     "lcb": partial(RatedReward, statistic="bound"),
     "screening": Screening,
     "uard": uard,

@@ -137,10 +137,25 @@ def fit_raters(feedback: Feedback, rated: Bool[Array, "*batch"]) -> RaterStatist
         feedback: Of every state-action.
         rated: Which of them were rated.
     """
+    return rater_statistics.fit(*flattened(feedback, rated))
+
+
+def flattened(
+    feedback: Feedback, rated: Bool[Array, "*batch"]
+) -> tuple[Float[Array, " n"], ByRater, Bool[Array, " n"]]:
+    """Return rewards, what each rater has said, and what was rated, of state-actions in one row.
+
+    Examples:
+        >>> import numpy as np
+        >>> from uard.ratings.aggregate import aggregate
+        >>> feedback = aggregate(np.zeros((3, 4, 2)), np.zeros((3, 4)))
+        >>> [x.shape for x in flattened(feedback, feedback.count > 0)[1]]
+        [(12, 2), (12, 2), (12, 2)]
+
+    Args:
+        feedback: Of state-actions in any shape.
+        rated: Which of them were rated.
+    """
     xp = namespace(feedback.mean)
-
-    def flat(x: Float[Array, "*batch K"]) -> Float[Array, "n K"]:
-        return xp.reshape(x, (-1, x.shape[-1]))
-
-    reward, rated = xp.reshape(feedback.proxy, (-1,)), xp.reshape(rated, (-1,))
-    return rater_statistics.fit(reward, ByRater._make(map(flat, each_rater(feedback))), rated)
+    by_rater = ByRater._make(xp.reshape(x, (-1, x.shape[-1])) for x in each_rater(feedback))
+    return xp.reshape(feedback.proxy, (-1,)), by_rater, xp.reshape(rated, (-1,))

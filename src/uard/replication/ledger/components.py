@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from uard.lab import statistics
 from uard.lab.statistics import Summary
 from uard.lab.views.study_results import StudyResults
 from uard.replication import paper
-from uard.replication.ledger.claim import Conditions, below
+from uard.replication.ledger.claim import Conditions, below, below_in
 from uard.replication.ledger.filters import READINGS
 from uard.replication.ledger.grids import FEW
 from uard.replication.verdicts import Opinion, Part, each
@@ -51,10 +52,15 @@ def _sources(results: StudyResults) -> dict[str, Any]:
     return {k: results.get("table5", "hacks", variant=v, reading="uard-paper") for k, v in variants.items()}
 
 
+def _less_with_both(n: Mapping[str, Any], without: str) -> bool:
+    variants = {k: n[k] for k in ("lite", "human")}
+    return below_in({k: n["both"] for k in variants}, variants, without)
+
+
 J32 = Conditions(
     (
-        Part("without sigma_h it hacks more than with both (intervals apart)", lambda n: below(n["both"], n["lite"])),
-        Part("without sigma_m it hacks more than with both (intervals apart)", lambda n: below(n["both"], n["human"])),
+        Part("without sigma_h it hacks more than with both (beyond noise)", lambda n: _less_with_both(n, "lite")),
+        Part("without sigma_m it hacks more than with both (beyond noise)", lambda n: _less_with_both(n, "human")),
         Part("sigma_m alone prevents more than sigma_h alone", lambda n: n["lite"].mean < n["human"].mean),
     ),
     _sources,
@@ -78,7 +84,7 @@ def _evolution(results: StudyResults) -> dict[str, Any]:
 J33 = Conditions(
     (
         Part(
-            "sigma_m at the trap falls: it ends below its peak (intervals apart)",
+            "sigma_m at the trap falls: it ends below its peak (beyond noise)",
             lambda n: below(n["end"], n["peak"]),
         ),
         Part(
@@ -111,9 +117,9 @@ def _sensitivity(results: StudyResults) -> dict[str, Any]:
 J34 = Conditions(
     (
         *each(
-            "{}: with lambda 1 it hacks more than with 2 (intervals apart)",
+            "{}: with lambda 1 it hacks more than with 2 (beyond noise)",
             SENSITIVITY,
-            lambda n, s: below(n["visits_default"][s], n["visits_small"][s]),
+            lambda n, s: below_in(n["visits_default"], n["visits_small"], s),
         ),
         *each(
             "{}: with lambda 5 it makes less than one visit per episode",
@@ -121,9 +127,9 @@ J34 = Conditions(
             lambda n, s: n["visits_five"][s].mean < FEW,
         ),
         *each(
-            "{}: with lambda 50 its true return is lower than with 2 (intervals apart)",
+            "{}: with lambda 50 its true return is lower than with 2 (beyond noise)",
             SENSITIVITY,
-            lambda n, s: below(n["true_large"][s], n["true_default"][s]),
+            lambda n, s: below_in(n["true_large"], n["true_default"], s),
         ),
     ),
     _sensitivity,
@@ -167,9 +173,9 @@ J38 = Conditions(
             lambda n, limit: n["deferred"][limit] > 0.01,
         ),
         *each(
-            "threshold 0.25, response {}: who defers makes fewer visits than who never does (intervals apart)",
+            "threshold 0.25, response {}: who defers makes fewer visits than who never does (beyond noise)",
             _RESPONSES,
-            lambda n, response: below(n["visits"][response], n["none"]),
+            lambda n, response: below_in(n["visits"], {k: n["none"] for k in n["visits"]}, response),
         ),
     ),
     _deferring,

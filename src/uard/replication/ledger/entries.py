@@ -8,6 +8,7 @@ from typing import Any
 
 from uard import __version__
 from uard.lab.views.study_results import StudyResults
+from uard.replication import paper
 from uard.replication.ledger import (
     components,
     deep,
@@ -80,4 +81,9 @@ def entry(claim: str, numbers: dict[str, Any] | None) -> Entry:
 
 def as_data(entries: Sequence[Entry], seeds: Sequence[int]) -> dict[str, Any]:
     """Return the ledger as plain data, for ``ledger.json``."""
-    return {"version": __version__, "seeds": list(seeds), "entries": [asdict(e) for e in entries]}
+    return {
+        "version": __version__,
+        "paper": paper.VERSION,
+        "seeds": list(seeds),
+        "entries": [asdict(e) for e in entries],
+    }

@@ -1,4 +1,4 @@
-"""The Reliability Filter as a function of its uncertainties: propositions, derivation and rival forms (J1-J4, J10-J14)."""
+"""The Reliability Filter as a function of its uncertainties: propositions, derivation and rival forms (J1-J4, J10-J14, A30)."""
 
 from __future__ import annotations
 
@@ -6,11 +6,19 @@ from typing import Any
 
 import numpy as np
 
+from uard.lab import statistics
 from uard.lab.statistics import Summary
 from uard.lab.views.study_results import StudyResults
-from uard.method.weights import ReliabilityFilter, exponential_weight, linear_weight, reciprocal_weight, wiener_weight
+from uard.method.weights import (
+    ReliabilityFilter,
+    certainty_equivalent_weight,
+    exponential_weight,
+    linear_weight,
+    reciprocal_weight,
+    wiener_weight,
+)
 from uard.replication import paper
-from uard.replication.ledger.claim import Conditions, below
+from uard.replication.ledger.claim import Conditions, below_in
 from uard.replication.verdicts import Opinion, Part, each
 
 
@@ -91,19 +99,26 @@ def _jumps() -> dict[str, float]:
     return {form: float(np.abs(np.diff(np.diff(w) / np.diff(u))).max()) for form, w in weights.items()}
 
 
-def _smooth(results: StudyResults) -> dict[str, Any]:
-    def early(form: str) -> dict[str, Summary]:
-        return {
-            name: results.window("filters", "success", 1, 100, form=form, reading=reading)
-            for name, reading in READINGS.items()
-        }
+def _early(results: StudyResults, form: str) -> dict[str, Summary]:
+    """Return the goal rate in the first 100 episodes, by reading."""
+    return {
+        name: results.window("filters", "success", 1, 100, form=form, reading=reading)
+        for name, reading in READINGS.items()
+    }
 
+
+def _late(results: StudyResults, metric: str, form: str) -> dict[str, Summary]:
+    """Return a metric of the last episodes, by reading."""
+    return {name: results.get("filters", metric, form=form, reading=reading) for name, reading in READINGS.items()}
+
+
+def _smooth(results: StudyResults) -> dict[str, Any]:
     jumps = _jumps()
     return {
         "jump": jumps["reciprocal"],
         "jump_linear": jumps["linear"],
-        "early": early("reciprocal"),
-        "early_linear": early("linear"),
+        "early": _early(results, "reciprocal"),
+        "early_linear": _early(results, "linear"),
     }
 
 
@@ -114,9 +129,9 @@ J4 = Conditions(
             lambda n: 100 * n["jump"] < n["jump_linear"],
         ),
         *each(
-            "{}: in the first 100 episodes the goal is reached more often than with the linear form (intervals apart)",
+            "{}: in the first 100 episodes the goal is reached more often than with the linear form (beyond noise)",
             READINGS,
-            lambda n, reading: below(n["early_linear"][reading], n["early"][reading]),
+            lambda n, reading: below_in(n["early_linear"], n["early"], reading),
         ),
     ),
     _smooth,
@@ -124,17 +139,14 @@ J4 = Conditions(
 
 
 def _rivals(results: StudyResults) -> dict[str, Any]:
-    def of(metric: str, form: str) -> dict[str, Summary]:
-        return {name: results.get("filters", metric, form=form, reading=reading) for name, reading in READINGS.items()}
-
     jumps = _jumps()
     return {
         "jump": jumps["reciprocal"],
         "jump_linear": jumps["linear"],
-        "visits": of("hacks", "reciprocal"),
-        "visits_linear": of("hacks", "linear"),
-        "goal": of("success_rate", "reciprocal"),
-        "goal_exponential": of("success_rate", "exponential"),
+        "visits": _late(results, "hacks", "reciprocal"),
+        "visits_linear": _late(results, "hacks", "linear"),
+        "goal": _late(results, "success_rate", "reciprocal"),
+        "goal_exponential": _late(results, "success_rate", "exponential"),
     }
 
 
@@ -145,14 +157,14 @@ J14 = Conditions(
             lambda n: n["jump_linear"] > 100 * n["jump"],
         ),
         *each(
-            "{}: linear subtraction collapses: more visits than with the reciprocal form (intervals apart)",
+            "{}: linear subtraction collapses: more visits than with the reciprocal form (beyond noise)",
             READINGS,
-            lambda n, reading: below(n["visits"][reading], n["visits_linear"][reading]),
+            lambda n, reading: below_in(n["visits"], n["visits_linear"], reading),
         ),
         *each(
-            "{}: exponential decay suppresses too much: fewer goals than with the reciprocal form (intervals apart)",
+            "{}: exponential decay suppresses too much: fewer goals than with the reciprocal form (beyond noise)",
             READINGS,
-            lambda n, reading: below(n["goal_exponential"][reading], n["goal"][reading]),
+            lambda n, reading: below_in(n["goal_exponential"], n["goal"], reading),
         ),
     ),
     _rivals,
@@ -262,4 +274,72 @@ J13 = Conditions(
     _gradients,
 )
 
-CONDITIONS = {"J1": J1, "J2": J2, "J3": J3, "J4": J4, "J10": J10, "J11": J11, "J12": J12, "J13": J13, "J14": J14}
+_REWARDS = {"trap": 4.0, "goal": 10.0}
+
+
+def _spread(results: StudyResults, form: str) -> dict[str, Summary]:
+    """Return the SD of the true return over the last episodes, by reading."""
+
+    def curves(reading: str) -> np.ndarray:
+        return results.curves("filters", "true_return", form=form, reading=reading)[:, -paper.LAST_EPISODES :]
+
+    return {name: statistics.summarise(curves(reading).std(1, ddof=1)) for name, reading in READINGS.items()}
+
+
+def _squared(results: StudyResults) -> dict[str, Any]:
+    squared = "certainty-equivalent"
+    return {
+        "weight": {name: float(reciprocal_weight(r, paper.LAMBDA)) for name, r in _REWARDS.items()},
+        "weight_squared": {name: float(certainty_equivalent_weight(r, r)) for name, r in _REWARDS.items()},
+        "crossing": {name: 2 * r for name, r in _REWARDS.items()},  # 2 lambda mu / kappa
+        "trap": paper.BETA * paper.SIGMA_H_AT_TRAP,
+        "early": _early(results, "reciprocal"),
+        "early_squared": _early(results, squared),
+        "visits": _late(results, "hacks", "reciprocal"),
+        "visits_squared": _late(results, "hacks", squared),
+        "spread": _spread(results, "reciprocal"),
+        "spread_squared": _spread(results, squared),
+    }
+
+
+A30 = Conditions(
+    (
+        *each(
+            "{}: where U is as large as the reward itself, the squared form leaves less of it",
+            _REWARDS,
+            lambda n, reward: n["weight_squared"][reward] < n["weight"][reward],
+        ),
+        *each(
+            "{}: squared uncertainty suppresses exploration: in the first 100 episodes it reaches the goal less often "
+            "(paired, Holm)",
+            READINGS,
+            lambda n, reading: below_in(n["early_squared"], n["early"], reading),
+        ),
+        *each(
+            "{}: squared uncertainty is unstable: a larger SD of the true return over the last hundred episodes "
+            "(paired, Holm)",
+            READINGS,
+            lambda n, reading: below_in(n["spread"], n["spread_squared"], reading),
+        ),
+        *each(
+            "{}: the linear form discounts what it should: fewer visits of the trap (paired, Holm)",
+            READINGS,
+            lambda n, reading: below_in(n["visits"], n["visits_squared"], reading),
+        ),
+        Opinion("the paper shows a comparison of both, discrete or continuous", False),
+    ),
+    _squared,
+)
+
+CONDITIONS = {
+    "J1": J1,
+    "J2": J2,
+    "J3": J3,
+    "J4": J4,
+    "J10": J10,
+    "J11": J11,
+    "J12": J12,
+    "J13": J13,
+    "J14": J14,
+    "A30": A30,
+}

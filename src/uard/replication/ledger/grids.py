@@ -1,4 +1,4 @@
-"""What tabular agents do on the paper's grids (J15, J17-J20, J26-J30)."""
+"""What tabular agents do on the paper's grids (J15, J17-J20, J26-J30, L975, L1945)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from uard.lab import statistics
 from uard.lab.statistics import Summary
 from uard.lab.views.study_results import StudyResults
 from uard.replication import paper
-from uard.replication.ledger.claim import Conditions, agrees, reduction
+from uard.replication.ledger.claim import Conditions, above_zero, agrees, below_in, reduction
 from uard.replication.ledger.tables import SIZES
 from uard.replication.studies.grids import PANELS
 from uard.replication.verdicts import Opinion, Part, each
@@ -281,6 +281,83 @@ J30 = Conditions(
     _competence,
 )
 
+
+def _complexity(results: StudyResults) -> dict[str, Any]:
+    def of(metric: str, size: str) -> np.ndarray:
+        return results.per_seed("scale", metric, agent="uard-paper", size=_size(size), panel="main")
+
+    return {
+        "visits": {name: statistics.summarise(of("hacks", name)) for name in SIZES},
+        "per_step": {name: statistics.summarise(of("hacks", name) / of("episode_length", name)) for name in SIZES},
+        "reduction": _reductions(results),
+        "printed": {f"{row.size}x{row.size}": row.uard for row in paper.TABLE_2},
+    }
+
+
+L975 = Conditions(
+    (
+        *each(
+            "{}: UARD makes more visits per episode than on 6x6 (paired, Holm)",
+            SIZES[1:],
+            lambda n, size: below_in({s: n["visits"]["6x6"] for s in SIZES[1:]}, n["visits"], size),
+        ),
+        *each(
+            "{}: and not only because episodes are longer: more visits per step, too (paired, Holm)",
+            SIZES[1:],
+            lambda n, size: below_in({s: n["per_step"]["6x6"] for s in SIZES[1:]}, n["per_step"], size),
+        ),
+        *each(
+            "{}: relative to the baseline the reduction remains substantial: half or more",
+            SIZES[1:],
+            lambda n, size: n["reduction"][size] >= 0.5,
+        ),
+    ),
+    _complexity,
+)
+
+
+def _fluctuation(results: StudyResults) -> dict[str, Any]:
+    curves = {a: results.curves("table4", "true_return", agent=a, panel="main") for a in ("baseline", "multi-head")}
+    goals = results.curves("table4", "success", agent="baseline", panel="main")
+    late = {a: c[:, -paper.LAST_EPISODES :].std(1, ddof=1) for a, c in curves.items()}
+    numbers: dict[str, Any] = paper.FIGURES["G8"].numbers
+    return {
+        "lowest": float(curves["baseline"].min()),
+        "highest": float(curves["baseline"].max()),
+        "lowest_heads": float(curves["multi-head"].min()),
+        "goals": statistics.summarise(goals.mean(1)),
+        "late_goals": float(goals[:, -paper.LAST_EPISODES :].mean()),
+        "steadier": statistics.summarise(late["baseline"] - late["multi-head"]),
+        "printed": numbers["baseline"][0],
+        "printed_high": numbers["baseline"][1],
+        "printed_heads": numbers["multi-head lowest"],
+    }
+
+
+L1945 = Conditions(
+    (
+        Part("the baseline's worst episode of all seeds is as low as printed", lambda n: n["lowest"] <= n["printed"]),
+        Part(
+            "its best episode of all seeds is no higher than printed",
+            lambda n: n["highest"] <= n["printed_high"],
+        ),
+        Part(
+            "it reaches the goal occasionally: in some of its episodes, and in fewer than half",
+            lambda n: 0 < n["goals"].mean < MOST,
+        ),
+        Part(
+            "the multi-head agent is more stable: the SD of its true return over the last hundred episodes is lower "
+            "(interval of the difference above 0)",
+            lambda n: above_zero(n["steadier"]),
+        ),
+        Part(
+            "and prone to drops: its worst episode is as low as printed",
+            lambda n: n["lowest_heads"] <= n["printed_heads"],
+        ),
+    ),
+    _fluctuation,
+)
+
 CONDITIONS = {
     "J15": J15,
     "J17": J17,
@@ -292,4 +369,6 @@ CONDITIONS = {
     "J28": J28,
     "J29": J29,
     "J30": J30,
+    "L975": L975,
+    "L1945": L1945,
 }

@@ -11,7 +11,8 @@ from importlib import resources
 from typing import Any
 
 from uard.lab.statistics import Summary
-from uard.lab.views.tables import brief, full, number
+from uard.lab.views.tables import bounds, brief, full, mean_sd, number
+from uard.replication.paper import Stat
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,11 @@ class Template(string.Formatter):
 
 
 def _interval(s: Summary) -> str:
-    return f"{number(s.mean)} [{number(s.ci95[0])}, {number(s.ci95[1])}]"
+    return f"{number(s.mean)}{bounds(s.ci95)}" if s.ci95 else brief(s)
+
+
+def _brief(s: Summary | Stat) -> str:
+    return brief(s) if isinstance(s, Summary) else mean_sd(s.mean, s.sd)
 
 
 def _percent(share: float) -> str:
@@ -87,7 +92,7 @@ def _p_value(p: float) -> str:
 _FORMATS: dict[str, Callable[[Any], str]] = {
     "full": full,
     "ci": _interval,
-    "brief": brief,
+    "brief": _brief,
     "percent": _percent,
     "p": _p_value,
 }

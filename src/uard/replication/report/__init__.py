@@ -16,7 +16,7 @@ from uard.lab.views.sections import Section
 from uard.lab.views.study_results import StudyResults
 from uard.lab.views.tables import Table
 from uard.lab.views.templates import render, table
-from uard.replication import audit, deep, figures, ledger, locomotion
+from uard.replication import audit, deep, figures, ledger, locomotion, paper
 from uard.replication.ledger import Entry
 from uard.replication.report import tables, walks
 
@@ -89,7 +89,10 @@ def _shown(these: Sequence[Table]) -> str:
 
 
 def _short(results: StudyResults, entries: Sequence[Entry], verdicts: Mapping[str, int]) -> Section:
-    html = render(HERE, "short.html.j2", headline=tables.headline(results), claims=len(entries), verdicts=verdicts)
+    headline = tables.headline(results)
+    html = render(
+        HERE, "short.html.j2", headline=headline, claims=len(entries), verdicts=verdicts, version=paper.VERSION
+    )
     return Section("short", "In short", 10, html)
 
 
@@ -119,7 +122,7 @@ def _mujoco() -> Section:
 
 
 def _ledger(results: StudyResults, entries: Sequence[Entry], verdicts: Mapping[str, int]) -> Section:
-    html = render(HERE, "ledger.html.j2", entries=entries, verdicts=verdicts)
+    html = render(HERE, "ledger.html.j2", entries=entries, verdicts=verdicts, version=paper.VERSION)
     data = json.dumps(ledger.as_data(entries, results.seeds), indent=2, allow_nan=False) + "\n"
     css, js = _text("ledger.css"), _text("ledger.js")
     return Section("ledger", "Ledger of claims", 110, html, "Ledger", css, js, files={"ledger.json": data})

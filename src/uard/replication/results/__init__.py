@@ -9,5 +9,6 @@ from uard.lab.views.published import ResultFiles
 
 def files() -> ResultFiles:
     """Return where they are (entry point of ``uard.results``)."""
-    studies = ("grid-deep.json", "mujoco-one.json", "mujoco-eight.json", "mujoco.json")  # of three seeds, the last
+    mujoco = ("mujoco-one.json", "mujoco-eight.json", "mujoco.json", "mujoco-drift.json")  # of a cell, the last
+    studies = ("grid-deep.json", *mujoco)
     return ResultFiles(resources.files(__name__), studies)

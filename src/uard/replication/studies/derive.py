@@ -14,6 +14,9 @@ from uard.lab.trainers import examine
 from uard.method import bellman, calibration
 from uard.replication import distortion
 
+BINS = 20  # of a training's steps
+EVERY = 5  # steps of an episode that are published as one
+LEARNED = ("hacks", "true_return", "observed_return")  # the first columns of the log
 SIGMA_QUALITY = ("auroc_unseen", "spearman_error")
 
 
@@ -57,3 +60,49 @@ def reactions(cell: Cell, found: Mapping[int, Result]) -> dict[str, Any]:
         "reaction": [examine.reaction(r.extra["trace"]) for r in results],
         "trace": results[0].extra["trace"].T,
     }
+
+
+def drifting(cell: Cell, found: Mapping[int, Result]) -> dict[str, Any]:
+    """How each seed's training went, by environment steps, and what a kick does after it.
+
+    ``learning`` (BINS, len(LEARNED)) are means over the episodes that ended in each part of the training; ``kicked`` is
+    ``examine.examine``'s, its steps in groups of ``EVERY``.
+    """
+    assert cell.steps is not None
+    results = list(found.values())
+    return {
+        "learning": [learning(r.log[:, : len(LEARNED)], r.extra["ends"], cell.steps) for r in results],
+        "kicked": [grouped(r.extra["kicked"]).round(3) for r in results],
+    }
+
+
+def learning(log: np.ndarray, ends: np.ndarray, steps: int) -> np.ndarray:
+    """Return means of the columns (episodes, C) over the episodes that ended in each part of a training, (BINS, C).
+
+    A part in which no episode ended has the means of the one before it.
+
+    Examples:
+        >>> learning(np.array([[1.0], [3.0], [7.0]]), np.array([1, 5, 200]), 200)[[0, 1, 19]].tolist()
+        [[2.0], [2.0], [7.0]]
+
+    Args:
+        log: Of the episodes.
+        ends: Environment step at which each ended, (episodes,).
+        steps: Of the whole training; what ends after them counts with the last part.
+    """
+    part = np.minimum((ends * BINS / steps).astype(int), BINS - 1)
+    means, last = [], np.zeros(log.shape[1])
+    for i in range(BINS):
+        last = log[part == i].mean(0) if (part == i).any() else last
+        means.append(last)
+    return np.array(means)
+
+
+def grouped(kicked: np.ndarray) -> np.ndarray:
+    """Return (kicks, steps, columns) in groups of ``EVERY`` steps, each step as heavy as the copies that stand then."""
+    standing = kicked[..., :1]
+    groups = (len(kicked), -1, EVERY)
+    weights = standing.reshape(*groups, 1)
+    sums = (kicked.reshape(*groups, kicked.shape[-1]) * weights).sum(2)
+    means = sums / np.maximum(weights.sum(2), 1e-9)
+    return np.concatenate([weights.mean(2), means[..., 1:]], -1)

@@ -148,6 +148,16 @@ def kick(scale: Scale) -> tuple[Row, ...]:
     )
 
 
+def drift(scale: Scale) -> tuple[Row, ...]:
+    """PPO over its training (G6, G7), and kicked afterwards (G10): both robots, vibration, main panel."""
+    agent, steps = scale.agents["ppo"]
+    return tuple(
+        row(_cell(Locomotion(robot), named(mitigation), agent, steps), robot=robot, mitigation=mitigation)
+        for robot in scale.robots
+        for mitigation in ("raw", "uard-paper", "uard-0.1")
+    )
+
+
 def ablation(scale: Scale) -> tuple[Row, ...]:
     """H8 in its continuous form: which source does the work; and what a SAC gains whose actor climbs the score, too."""
     both: dict[str, Any] = {"both sources": {}}
@@ -252,6 +262,13 @@ def studies(scale: Scale) -> tuple[Study, ...]:
         Study(f"{of}-bonuses", f"Bonuses of 4, 6 and 8, {scale.name}", "DESIGN: what breaks which", bonuses(scale)),
         Study(f"{of}-noise", f"Violations against noise, {scale.name}", "H11, G11, J25", noise(scale)),
         Study(f"{of}-kick", f"A kick, {scale.name}", "H12, G10", kick(scale)),
+        Study(
+            f"{of}-drift",
+            f"Over the training, and a kick after it, {scale.name}",
+            "H4, H12, G6, G7, G10",
+            drift(scale),
+            derive=derive.drifting,
+        ),
         Study(f"{of}-ablation", f"Which source does the work in MuJoCo, {scale.name}", "H8", ablation(scale)),
         Study(f"{of}-legitimate", f"Bonuses that are real, {scale.name}", "over-caution", legitimate(scale)),
         Study(f"{of}-caution", f"What listening costs, {scale.name}", "over-caution", caution(scale)),

@@ -24,8 +24,9 @@ from uard.training.compiled import runs
 from uard.training.episode_log import LOG
 from uard.training.tracing import traceable
 
-CHUNK = 512  # steps whose random numbers are drawn together; the panel's statistics are measured once a chunk
-EARLY = np.isin(np.arange(CHUNK), [0, *(2**i for i in range(CHUNK.bit_length()))])  # when it is measured in the first
+CHUNK = 512  # steps whose random numbers are drawn together; the panel's statistics are measured once a chunk, or,
+# where a rule asks for them early, whenever the number of steps has doubled: so in the first chunk, at
+DOUBLED = np.isin(np.arange(CHUNK), [0, *(2**i for i in range(CHUNK.bit_length()))])
 ROOM = 64  # a program has room for this many runs, or a multiple
 
 
@@ -151,6 +152,7 @@ def train_one(run: Run, program: Program) -> TrainedTables:
     starts = jnp.atleast_1d(jnp.asarray(task.start, jnp.int32))
     raters = run.law.centre.shape[-1]
     asks_raters = mitigation.reads_feedback
+    doubles = mitigation.refits_early and asks_raters
     # One row per state-action, so that a step reads each table once.
     ones = jnp.ones_like(task.reward)
     columns = [run.truth.hack, run.truth.reward, task.reward, run.truth.goal, ones, 0.0 * ones]
@@ -266,9 +268,13 @@ def train_one(run: Run, program: Program) -> TrainedTables:
         draws = _drawn(run, number, actions, raters if asks_raters else None)
         slot = c.episode * program.snapshots // program.episodes
         if refits:
-            c, _ = lax.scan(refitting_step, c, (jnp.asarray(EARLY), draws))
+            c, _ = lax.scan(refitting_step, c, (jnp.asarray(DOUBLED), draws))
         else:
-            if asks_raters:
+            if doubles:
+                chunks = number - 1
+                fits = (chunks & (chunks - 1)) == 0
+                c = c._replace(statistics=lax.cond(fits, panel_statistics, lambda rows: c.statistics, c.rows))
+            elif asks_raters:
                 c = c._replace(statistics=panel_statistics(c.rows))
             c, _ = lax.scan(one_step, c, draws)
         if program.snapshots:
@@ -295,7 +301,7 @@ def train_one(run: Run, program: Program) -> TrainedTables:
     )
     kept = jnp.zeros((program.snapshots, *q.shape)), jnp.zeros((program.snapshots, *rows.shape))
     loop = start, jnp.uint32(1), *kept
-    if mitigation.refits_early and asks_raters:
+    if doubles:
         loop = chunk(loop, refits=True)
     c, _, q_kept, rows_kept = lax.while_loop(lambda loop: loop[0].episode < program.episodes, chunk, loop)
     log = c.log[:-1]  # what came after the last episode was put into the last row

@@ -120,7 +120,7 @@ class RatingModel:
 class Model(NamedTuple):
     """Trained and fixed layers, Adam's moments, and the units (outputs,) of location and scale.
 
-    The last is the variance (K,) of one answer of each rater about its prediction; infinite for who never answered.
+    The last is the variance (K,) of one answer of each rater about its prediction; negative for who never answered.
     """
 
     layers: tuple[Layer, ...]
@@ -139,7 +139,7 @@ def init(spec: RatingModel, key: Array, features: int, actions: int, raters: int
     layers = mlp(own, sizes, spec.members, last_gain=0.1)
     prior = mlp(fixed, sizes, spec.members)
     ones = jnp.ones(outputs, jnp.float32)
-    silent = jnp.full(raters, jnp.inf, jnp.float32)
+    silent = jnp.full(raters, -1.0, jnp.float32)
     return Model(layers, prior, optax.adam(spec.learning_rate).init(layers), 0.0 * ones, ones, silent)
 
 
@@ -164,12 +164,12 @@ def read(spec: RatingModel, model: Model, observations: Array, actions: int, rat
     everybody = jnp.full_like(proxy, raters)
     if spec.predicts == "ratings":
         return Feedback(count, predicted[..., 0], lowest, jnp.maximum(sd, 0.0), proxy, everybody)
-    heard = jnp.isfinite(model.noise)
+    heard = model.noise >= 0
     noise = jnp.where(heard, model.noise, 0.0)
     variance = (model.scale * out)[..., :raters].var(0, ddof=1)
     answers = jnp.where(heard, noise / jnp.maximum(variance, 1e-6 * model.scale[0] ** 2), 0.0)
     ratings = proxy[..., None] + predicted[..., :raters]
-    mean = jnp.where(heard, ratings, 0.0).sum(-1) / jnp.maximum(heard.sum(), 1)
+    mean = jnp.where(heard, ratings, 0.0).sum(-1) / jnp.maximum(heard.astype(jnp.float32).sum(), 1.0)
     by_rater = ByRater(answers, ratings, noise * jnp.maximum(answers - 1.0, 0.0))
     return Feedback(count, mean, proxy + lowest, jnp.maximum(sd, 0.0), proxy, everybody, by_rater)
 
@@ -247,6 +247,6 @@ def with_noise(spec: RatingModel, model: Model, known: Memory, observe: Any, act
     out = _predict(spec, model.layers, model.prior, jax.vmap(observe)(known.states), actions).mean(0)
     predicted = (model.location + model.scale * out)[jnp.arange(len(count)), known.actions, :raters]
     each = m2 / jnp.maximum(count, 1.0) + (predicted - targets[:, :raters]) ** 2
-    answered = here[:, :raters].sum(0)
-    mean = jnp.where(here[:, :raters], each, 0.0).sum(0) / jnp.maximum(answered, 1)
-    return model._replace(noise=jnp.where(answered > 0, mean, jnp.inf))
+    answered = here[:, :raters].astype(jnp.float32).sum(0)
+    mean = jnp.where(here[:, :raters], each, 0.0).sum(0) / jnp.maximum(answered, 1.0)
+    return model._replace(noise=jnp.where(answered > 0, mean, -1.0))

@@ -99,12 +99,14 @@ class Reservoir(NamedTuple):
 
     Attributes:
         inputs: (M, features) of the steps.
-        targets: (M, K + 1), each rater's rating (NaN where one is missing), and their deviation.
+        targets: (M, K + 1), each rater's rating (0 where one is missing), and their deviation.
+        answered: (M, K + 1), whether it is there.
         seen: (1,), how many steps were rated so far.
     """
 
     inputs: np.ndarray
     targets: np.ndarray
+    answered: np.ndarray
     seen: np.ndarray
 
 
@@ -122,7 +124,7 @@ def width(features: int, actions: int) -> int:
 def empty(spec: TransitionModel, width: int, raters: int) -> Reservoir:
     """Return a reservoir of nothing."""
     inputs, targets = (np.zeros((spec.capacity, w), np.float32) for w in (width, raters + 1))
-    return Reservoir(inputs, targets, np.zeros(1, np.int64))
+    return Reservoir(inputs, targets, np.zeros(targets.shape, bool), np.zeros(1, np.int64))
 
 
 def keep(
@@ -131,11 +133,13 @@ def keep(
     """Put rated steps into the sample [Vitter 1985, algorithm R]; ratings (B, K), NaN where one is missing."""
     capacity = len(reservoir.inputs)
     targets = np.column_stack([ratings, aggregate(ratings, np.zeros(len(ratings)), ddof=ddof).sd])
+    answered = ~np.isnan(targets)
+    rows = inputs, np.where(answered, targets, 0.0), answered
     numbers = reservoir.seen[0] + np.arange(len(inputs))
     places = np.where(numbers < capacity, numbers, random.integers(0, numbers + 1))
-    for place, x, y in zip(places, inputs, targets, strict=True):  # in order: a later one may take an earlier's place
-        if place < capacity:
-            reservoir.inputs[place], reservoir.targets[place] = x, y
+    kept = places < capacity
+    for table, new in zip(reservoir[:3], rows, strict=True):
+        table[places[kept]] = new[kept]  # where two take one place, NumPy leaves the later
     reservoir.seen[0] += len(inputs)
 
 
@@ -164,7 +168,7 @@ def chosen(query: str, share: float, knows: Callable[[], np.ndarray], rows: int,
 class Model(NamedTuple):
     """Layers, Adam's moments, and the units: location and scale of the inputs, location and scale of the targets.
 
-    The last is the variance (K,) of one answer of each rater about its prediction; infinite for who never answered.
+    The last is the variance (K,) of one answer of each rater about its prediction; negative for who never answered.
     """
 
     layers: tuple[Layer, ...]
@@ -184,7 +188,7 @@ def init(spec: TransitionModel, key: Array, width: int, raters: int) -> Model:
     prior = mlp(fixed, (width, spec.hidden, raters + 1), spec.members)
     zeros, ones = jnp.zeros(width, jnp.float32), jnp.ones(width, jnp.float32)
     location = jnp.zeros(raters + 1, jnp.float32)
-    optimiser, silent = optax.adam(spec.learning_rate).init(layers), jnp.full(raters, jnp.inf, jnp.float32)
+    optimiser, silent = optax.adam(spec.learning_rate).init(layers), jnp.full(raters, -1.0, jnp.float32)
     return Model(layers, prior, optimiser, zeros, ones, location, jnp.float32(1.0), silent)
 
 
@@ -225,7 +229,7 @@ def read(spec: TransitionModel, model: Model, inputs: Array, raters: int) -> Fee
     lowest = mean + soft_threshold(ratings - means, spec.deviations).min(-1)
     typical = model.location[-1]
     sd = jnp.maximum(typical + soft_threshold(predicted[..., -1] - typical, spec.deviations), 0.0)
-    heard = jnp.isfinite(model.noise)
+    heard = model.noise >= 0
     noise = jnp.where(heard, model.noise, 0.0)
     answers = jnp.where(heard, noise / jnp.maximum(ratings.var(0, ddof=1), 1e-6 * model.scale**2), 0.0)
     by_rater = ByRater(answers, ratings.mean(0), noise * jnp.maximum(answers - 1.0, 0.0))
@@ -305,18 +309,17 @@ def expecting(statistics: Any, feedback: Feedback) -> Any:
 
 def fit(spec: TransitionModel, model: Model, reservoir: Reservoir, key: Array) -> Model:
     """Train for ``fits`` minibatches of what the reservoir holds; unchanged before the first rating."""
-    gaps = bool(np.isnan(reservoir.targets).any())
-    return _fit(spec, model, reservoir.inputs, reservoir.targets, reservoir.seen[0], key, gaps=gaps)
+    return _fit(spec, model, *reservoir[:3], reservoir.seen[0], key)
 
 
-@partial(jax.jit, static_argnames=("spec", "gaps"))
+@partial(jax.jit, static_argnames="spec")
 def _fit(
-    spec: TransitionModel, model: Model, inputs: Array, targets: Array, seen: Array, key: Array, *, gaps: bool
+    spec: TransitionModel, model: Model, inputs: Array, targets: Array, answered: Array, seen: Array, key: Array
 ) -> Model:
-    """Train on the first ``seen`` rows; with ``gaps`` a target of NaN is a rating that is missing."""
+    """Train on the first ``seen`` rows."""
     filled = jnp.minimum(seen, inputs.shape[0])
     mask = (jnp.arange(inputs.shape[0]) < filled)[:, None]
-    here = mask & ~jnp.isnan(targets) if gaps else jnp.broadcast_to(mask, targets.shape)
+    here = mask & answered
 
     def moments(x: Array, here: Array) -> tuple[Array, Array]:
         total = jnp.maximum(here.sum(0), 1).astype(jnp.float32)
@@ -341,9 +344,8 @@ def _fit(
 
         def loss(layers: Any) -> Array:
             out = _predict(spec, layers, model.prior, x)
-            # A missing rating is as if it had been predicted.
-            aim = jnp.where(jnp.isnan(target), lax.stop_gradient(out), target) if gaps else target
-            return optax.losses.huber_loss(out, aim).mean((1, 2)).sum()
+            each = jnp.where(answered[drawn], optax.losses.huber_loss(out, target), 0.0)
+            return each.mean((1, 2)).sum()
 
         return descend(spec.learning_rate, jax.grad(loss)(layers), optimiser, layers), None
 
@@ -352,7 +354,7 @@ def _fit(
         lambda new, old: jnp.where(filled > 0, new, old), carry, (model.layers, model.optimiser)
     )
     apart = location + scale * _predict(spec, layers, model.prior, _normal(model, inputs)).mean(0) - targets
-    answered = here[:, :-1].sum(0)
+    answers = here[:, :-1].astype(jnp.float32).sum(0)
     square = jnp.where(here[:, :-1], apart[:, :-1] ** 2, 0.0).sum(0)
-    noise = jnp.where(answered > 0, square / jnp.maximum(answered, 1), jnp.inf)
+    noise = jnp.where(answers > 0, square / jnp.maximum(answers, 1.0), -1.0)
     return model._replace(layers=layers, optimiser=optimiser, noise=noise)
