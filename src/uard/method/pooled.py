@@ -140,7 +140,8 @@ def variance_between(
     raters = xp.sum(xp.astype(here, said.dtype), axis=-1)
     excess = xp.maximum(xp.sum(mean.weight * mean.gap**2, axis=-1) - (raters - 1.0), zero)
     several = raters > 1.0
-    squares = xp.sum(mean.weight**2, axis=-1) / xp.where(several, mean.total, zero + 1.0)
+    total = xp.where(several, mean.total, zero + 1.0)
+    squares = xp.sum(mean.weight * (mean.weight / total[..., None]), axis=-1)  # no square: of tiny rewards it overflows
     return xp.where(several, excess / xp.where(several, mean.total - squares, zero + 1.0), zero)
 
 
