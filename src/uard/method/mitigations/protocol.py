@@ -61,8 +61,8 @@ class Explanation(NamedTuple):
 
     Attributes:
         signal: What is learned.
-        sigma_h: Disagreement of the raters (and of the proxy with them, if it counts); of ``uard``, tau. In reward units;
-            0 where nobody has rated.
+        sigma_h: Disagreement of the raters (and of the proxy with them, if it counts), in reward units; 0 where nobody
+            has rated. Of ``uard`` it is tau.
         lam: lambda_t; 0 for a mitigation that has none.
         weight: w in [0, 1]; 1 for a mitigation that has none.
         anchor: b, in reward units. Of a mitigation that discounts, what is learned is b + w (r - b), less the premium
