@@ -45,7 +45,7 @@ def test_exit_codes(log, capsys):
     assert doctor(capsys, lie)[0] == 0  # uard avoids it: a note
     assert doctor(capsys, lie, "--strict")[0] == 0
     assert doctor(capsys, lie, "--mitigation", "uard-operator")[0] == 1
-    assert doctor(capsys, lie, "--set-mitigation", "proxy_is_rater=false")[0] == 1
+    assert doctor(capsys, lie, "--mitigation", "uard-0.1", "--set-mitigation", "proxy_is_rater=false")[0] == 1
     assert doctor(capsys, alone)[0] == 0  # one rater: a warning
     assert doctor(capsys, alone, "--strict")[0] == 1
 
@@ -100,7 +100,7 @@ def test_columns(log, capsys):
         ("log.csv --mitigation raw", "mitigation = 'raw': must be a form of the filter"),
         ("log.csv --mitigation urad", "mitigation = 'urad': must be one of "),
         ("log.csv --set-mitigation kapa=1", "mitigation setting = 'kapa': must be one of "),
-        ("log.csv --set-mitigation kappa=-1", "kappa = -1.0: must be"),
+        ("log.csv --set-mitigation risk=-1", "risk = -1.0: must be"),
         ("log.csv --json .", "json = '.': must be a file, not a folder"),
         ("empty.csv", "log = 'empty.csv': must be a CSV file whose first line names its columns"),
         ("nothing", "log = 'nothing': must be a file that ends in .csv"),

@@ -57,7 +57,7 @@ def board(tmp_path_factory):
         for panel, noise in (settings[:2] if where is not GRID else settings)
         for name in ("raw", "uard", "uard-paper", "lcb")
     ]
-    other = Cell(GRID, named("uard", kappa=3.0), QLearning(heads=2), episodes=150)
+    other = Cell(GRID, named("uard", risk=3.0), QLearning(heads=2), episodes=150)
     runner.run([*((c, seed) for c in cells for seed in range(3)), (other, 0)], store, workers=1)
     failed = Cell(GRID, named("lcb", k=7.0), episodes=150)
     with sqlite3.connect(store.path) as db:
@@ -163,7 +163,7 @@ def test_controls_and_failures_are_told_apart(board):
     (failed,) = [x for x in board.lines if x.failed]
     assert (failed.mitigation, failed.seeds, failed.failed, failed.true) == ("lcb, k 7", 0, 2, None)
     (single,) = [x for x in board.lines if x.seeds == 1]
-    assert (single.mitigation, single.agent) == ("uard, kappa 3", "q-learning, heads 2")
+    assert (single.mitigation, single.agent) == ("uard, risk 3", "q-learning, heads 2")
 
 
 def test_lines_are_ranked_within_their_setting(board):
@@ -216,7 +216,7 @@ def test_sorting_by_a_column(opened):
         assert values == sorted(values, key=lambda v: sign * v)
         assert len(set(values)) > 5
     table.get_by_role("button", name="mitigation").click()
-    order = ["lcb", "lcb, k 7", "raw", "uard", "uard-paper", "uard, kappa 3"]
+    order = ["lcb", "lcb, k 7", "raw", "uard", "uard-paper", "uard, risk 3"]
     assert list(dict.fromkeys(column(page, "mitigation"))) == order
     table.get_by_role("button", name="mitigation").click()
     assert list(dict.fromkeys(column(page, "mitigation"))) == order[::-1]

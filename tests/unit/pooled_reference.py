@@ -98,7 +98,9 @@ def reward(n, mean, m2, r, panel, doubt=0.0):
     centred = -0.5 * (p * (z - r[:, None]) ** 2).sum(1)
     odds = np.clip(apart - centred + np.log(PI / (1 - PI)), -50, 50)
     w = 1 / (1 + np.exp(odds))
-    b = mr - TAUS * np.sqrt(tau2) - SES / np.sqrt(sr)
+    # Differs from the first version: nobody is taken to mean less than the lowest that was said.
+    lowest = np.where(K > 0, np.where(here, z, np.inf).min(1), 0.0)
+    b = np.maximum(mr - TAUS * np.sqrt(tau2), lowest) - SES / np.sqrt(sr)
     x = b + w * (r - b) - RISK * np.sqrt(w * (1 - w)) * np.abs(r - b)
     unrated = np.minimum(r, panel["usual"] + UNRATED * (r - panel["usual"])) - RISK * doubt
     rated = K > 0

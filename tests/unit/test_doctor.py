@@ -122,10 +122,11 @@ def test_one_rater_is_blind_trust_for_the_printed_filter():
     # Scale 4 sqrt(0.1 0.9) = 1.2. sigma_h with the reward counted is 4/2 = 2 in a tenth of the rows: location 0.2,
     # deviation 0.36, z = 5, lambda_t = 0.2 (1 + 50 * 4) = 40.2, U = 0.5 * 2 / 1.2 and w = 1 / (1 + 33.5).
     log = two_kinds((0.0, [0.0]), (4.0, [0.0]))
-    printed, ours = (finding(doctor(log, m), "one-rater") for m in (PRINTED, "uard"))
-    assert (printed.severity, ours.severity) == ("danger", "warning")
+    printed, old, ours = (finding(doctor(log, m), "one-rater") for m in (PRINTED, "uard-0.1", "uard"))
+    assert (printed.severity, old.severity, ours.severity) == ("danger", "warning", "warning")
     assert printed.numbers[f"kept_{PRINTED}"] == 1.0
-    assert ours.numbers["kept_uard"] == pytest.approx(1 / 34.5)
+    assert old.numbers["kept_uard-0.1"] == pytest.approx(1 / 34.5)
+    assert ours.numbers["kept_uard"] == 0.0  # the one rater is believed, and a little less than that
     assert ours.numbers["contradicted_rows"] == 10
 
 
@@ -329,7 +330,7 @@ def test_filtered_rewards_are_what_the_doctor_looks_at():
     # The printed filter pays 4 / (1 + sd of {-1, 2, 1}) at the trap; see above for what uard makes of one rater.
     log = two_kinds((0.0, [0.0, 0.0, 0.0]), (4.0, [-1.0, 2.0, 1.0]))
     assert filtered(log, PRINTED)[[0, -1]] == pytest.approx([0.0, 4 / (1 + np.std([-1, 2, 1]))])
-    assert filtered(two_kinds((0.0, [0.0]), (4.0, [0.0])))[[0, -1]] == pytest.approx([0.0, 4 / 34.5])
+    assert filtered(two_kinds((0.0, [0.0]), (4.0, [0.0])), "uard-0.1")[[0, -1]] == pytest.approx([0.0, 4 / 34.5])
     half = clean()
     half.ratings[::2] = np.nan
     assert np.isfinite(filtered(half)).all()

@@ -36,8 +36,8 @@ def one_rater(case: Case) -> Finding | None:
         "danger" if blind else "warning",
         evidence,
         "One person never disagrees with itself: sigma_h = 0 is read as certainty, which means blind trust in the reward.",
-        "Count the reward as one more rater (proxy_is_rater=True, as uard does; it then lives on the distance between "
-        "rating and reward, which noise can hide), or have a second person rate a sample.",
+        "Compare ratings with the reward, as uard does (and uard-0.1 with proxy_is_rater=True); it then lives on their "
+        "distance, which noise can hide. Or have a second person rate a sample.",
         numbers,
     )
 
@@ -65,7 +65,7 @@ def contradicted(case: Case) -> Finding | None:
         f"{' and '.join(f'{name} still believes {percent(share)}' for name, share in kept.items())}.",
         "Agreement makes sigma_h small, so a filter that looks at the raters alone trusts the reward most where they "
         "all contradict it, and the agent learns to go there.",
-        f"Count the reward as one more rater (proxy_is_rater=True): named('uard') believes {percent(recommended)} of it here.",
+        f"Ask whether raters are centred at the reward, as named('uard') does: it believes {percent(recommended)} of it here.",
         {
             "rows": float(agreed.sum()),
             "largest": float(gap[worst]),

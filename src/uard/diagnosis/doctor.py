@@ -5,7 +5,7 @@ through the filter as printed, and checks what comes out. A trap of the printed 
 a ``note``; one that the chosen one is in, or that no filter avoids, is a ``warning`` or a ``danger``.
 
 Differences are measured in units: the standard deviation of the observed rewards. It is taken for granted that what is
-rated was rated often enough: the pseudo-count with which ``uard`` meets the first ratings is left out.
+rated was rated often enough: the pseudo-count with which ``uard-0.1`` meets the first ratings is left out.
 """
 
 from __future__ import annotations
@@ -131,6 +131,8 @@ def filtered(log: RatingLog, mitigation: str | Mitigation = "uard") -> Float[np.
         raise _checks.InvalidValueError("reward", None, f"there: {log.source} holds no rewards that could be filtered")
     _checks.finite("reward", log.reward)
     _checks.finite("ratings", np.where(np.isnan(log.ratings), 0.0, log.ratings))
+    if log.sigma_m is not None:
+        _checks.nonnegative("sigma_m", log.sigma_m)
     known, distinct = feedback_of(log.reward, log.ratings, numbered(log.item))
     return filtered_rows(as_filter(mitigation), log.reward, log.sigma_m, known, distinct)[1]
 

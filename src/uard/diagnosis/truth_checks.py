@@ -88,7 +88,7 @@ def blind_sigma(case: Case) -> Finding | None:
     truth = _truth(case)
     if truth is None or not truth.both_kinds():
         return None
-    quality = _quality(1.0 - case.chosen.weight, truth)
+    quality = _quality(np.round(1.0 - case.chosen.weight, 1), truth)  # less than a twentieth of doubt prevents nothing
     if quality["auroc"] >= 0.75:
         return None
     lies = int(truth.lie.sum())
@@ -96,7 +96,7 @@ def blind_sigma(case: Case) -> Finding | None:
         "blind-sigma",
         "danger" if quality["auroc"] < 0.6 else "warning",
         f"Of a row whose reward lies by more than a unit (there are {lies}) and one whose does not, {case.chosen.name} doubts "
-        f"the lie more in {percent(quality['auroc'])} of cases (AUROC of 1 - w; 50 % is chance). Spearman of 1 - w with "
+        f"the lie more in {percent(quality['auroc'])} of cases (AUROC of 1 - w in tenths; 50 % is chance). Spearman of 1 - w with "
         f"|reward - true|: {quality['spearman']:.2f}.",
         "The method assumes that the error grows with sigma. Here it does not: honest rewards are discounted as much as "
         "lies, which slows learning and prevents nothing.",

@@ -42,6 +42,7 @@ class Pool(NamedTuple):
         centre: Their pooled mean under *apart*.
         tau: By how much they differ beyond their own errors, a standard deviation: sigma_h.
         error: Standard error of ``centre``; 0 where nobody is heard.
+        lowest: The least that any of them says.
         log_odds: Logarithm of the odds of *apart* against *centred* without the prior, 0 where nobody is heard.
     """
 
@@ -49,6 +50,7 @@ class Pool(NamedTuple):
     centre: Float[Array, "*batch"]
     tau: Float[Array, "*batch"]
     error: Float[Array, "*batch"]
+    lowest: Float[Array, "*batch"]
     log_odds: Float[Array, "*batch"]
 
 
@@ -120,6 +122,7 @@ def pool(
         centre=xp.where(anybody, reward + gap, zero),
         tau=root(tau2),
         error=xp.where(anybody, 1.0 / xp.sqrt(precision), zero),
+        lowest=xp.where(anybody, reward + xp.min(xp.where(here, sums.gap, xp.inf), axis=-1), zero),
         log_odds=xp.where(anybody, 0.5 * (squares - determinants), zero),
     )
 
@@ -237,5 +240,6 @@ def _variance_between(s: _Sums) -> Float[Array, "*batch"]:
     several = s.heard > 1.0
     total = xp.where(several, s.total, zero + 1.0)
     excess = xp.maximum(s.second - s.first * s.first / total - (s.heard - 1.0), zero)
-    spread = xp.where(several, total - xp.sum(s.weight * s.weight, axis=-1) / total, zero + 1.0)
+    squares = xp.sum(s.weight * (s.weight / total[..., None]), axis=-1)  # no square: of tiny rewards it overflows
+    spread = xp.where(several, total - squares, zero + 1.0)
     return xp.where(several, excess / spread, zero)

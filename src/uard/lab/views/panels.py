@@ -306,7 +306,7 @@ def section(study: Study, found: Sequence[Regrets], seeds: int) -> Section:
 
 
 def _interval(s: Summary) -> str:
-    return f"{s.mean:.3f} [{s.ci95[0]:.3f}, {s.ci95[1]:.3f}]"
+    return f"{s.mean:.3f}" + (f" [{s.ci95[0]:.3f}, {s.ci95[1]:.3f}]" if s.ci95 else " (one scenario)")
 
 
 def _by(found: Regrets, group: Callable[[Scenario], str]) -> dict[str, np.ndarray]:

@@ -105,8 +105,9 @@ def _table(p: Published, s: Setting) -> Table:
     columns = ("learns from", "hacks", "true return", "of true reward", "of uncorrupted task", "seeds")
     caption = _rivals(p, s, "true_return")[1].caption() if s.one(OURS) else ""
     note = (
-        "Per episode over the last 100 of 200 000 steps, PPO; means [95 %]. Shares of the mean true return of the agent "
-        f"on the true reward, and of the plain agent where nothing lies. True return of each rival against uard: {caption}"
+        "Per episode over the last 100 of 200 000 steps, PPO; means [95 %]. Shares of the mean true return of the "
+        "agent on the true reward, and of the plain agent where nothing lies. True return of each rival against uard: "
+        f"{caption}"
     )
     return Table(s.name, columns, tuple(rows), 1, note)
 

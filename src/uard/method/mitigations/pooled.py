@@ -33,8 +33,8 @@ class Believed(NamedTuple):
 class PooledDiscounting(Mitigation):
     """Believe a reward as far as it is likelier that all raters are centred at it than that they are not.
 
-    What is learned is b + w (r - b) - risk sqrt(w (1 - w)) |r - b|, with b = pooled mean - contest tau - caution
-    standard errors. Where nobody has rated: min(r, u + unrated_weight (r - u)) - risk sigma_m, with u the usual reward.
+    What is learned is b + w (r - b) - risk sqrt(w (1 - w)) |r - b|, with b = pooled mean - contest tau, but not
+    below the lowest that anybody says, - caution standard errors. Where nobody has rated: min(r, u + unrated_weight (r - u)) - risk sigma_m, with u the usual reward.
 
     Examples:
         >>> import numpy as np
@@ -50,7 +50,7 @@ class PooledDiscounting(Mitigation):
     Attributes:
         lies: Prior share of rewards that lie, in (0, 1).
         slack: By which share of an unusual reward a rater may be off without a reason, >= 0.
-        contest: How many tau the anchor lies below the pooled mean, >= 0.
+        contest: How many tau the anchor lies below the pooled mean, >= 0; but not below the lowest that anybody says.
         caution: How many standard errors of the pooled mean it lies below that, >= 0.
         risk: Premium >= 0 for not knowing which hypothesis holds, in posterior standard deviations.
         unrated_weight: How far an extraordinary reward is believed that nobody has rated, in [0, 1]. A higher one
@@ -117,7 +117,7 @@ class PooledDiscounting(Mitigation):
         odds = prior * xp.exp(xp.clip(p.log_odds, -pooled.LARGEST_ODDS, pooled.LARGEST_ODDS))
         w = 1.0 / (1.0 + odds)
         deviation = xp.sqrt(odds) * w  # sqrt(w (1 - w)), with a finite gradient
-        b = p.centre - self.contest * p.tau - self.caution * p.error
+        b = xp.maximum(p.centre - self.contest * p.tau, p.lowest) - self.caution * p.error
         learned = b + w * (r - b) - self.risk * deviation * abs(r - b)
         u = statistics.usual
         unrated = xp.minimum(r, u + self.unrated_weight * (r - u)) - self.risk * doubt

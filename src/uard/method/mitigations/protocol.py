@@ -62,10 +62,11 @@ class Explanation(NamedTuple):
     Attributes:
         signal: What is learned.
         sigma_h: Disagreement of the raters (and of the proxy with them, if it counts), in reward units; 0 where nobody
-            has rated.
+            has rated. Of ``uard`` it is tau.
         lam: lambda_t; 0 for a mitigation that has none.
         weight: w in [0, 1]; 1 for a mitigation that has none.
-        anchor: b, in reward units. Of a mitigation that discounts, what is learned is b + w (r - b).
+        anchor: b, in reward units. Of a mitigation that discounts, what is learned is b + w (r - b), less the premium
+            risk sqrt(w (1 - w)) |r - b| of ``uard`` for not knowing whether the reward lies.
         doubt: Total uncertainty U, in reward units.
     """
 

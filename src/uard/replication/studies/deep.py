@@ -17,7 +17,7 @@ from uard.training.feedback.rating_model import RatingModel
 
 AGENTS = deep_agents()
 ENSEMBLE = AGENTS["ensemble-dqn"]
-LEARNED = RatingModel()
+LEARNED = RatingModel(predicts="ratings")  # as published: what all raters say together
 CURVES = ("observed_return", "hacks", "success")
 
 
