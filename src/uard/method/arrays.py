@@ -93,7 +93,7 @@ def _by_bisection(values: Array, index: Array) -> Array:
         return xp.where(below, low, middle + 1), xp.where(below, middle, high)
 
     ends = xp.full(index.shape, limits.min, kind), xp.full(index.shape, limits.max, kind)
-    low, _ = lax.fori_loop(0, limits.bits, halve, ends)
+    low, _ = lax.fori_loop(0, limits.bits, halve, ends)  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
     return xp.min(xp.where(bits == low[..., None], values[..., None, :], xp.inf), axis=-1)
 
 

@@ -34,7 +34,8 @@ class PooledDiscounting(Mitigation):
     """Believe a reward as far as it is likelier that all raters are centred at it than that they are not.
 
     What is learned is b + w (r - b) - risk sqrt(w (1 - w)) |r - b|, with b = pooled mean - contest tau, but not
-    below the lowest that anybody says, - caution standard errors. Where nobody has rated: min(r, u + unrated_weight (r - u)) - risk sigma_m, with u the usual reward.
+    below the lowest that anybody says, - caution standard errors. Where nobody has rated: min(r, u + unrated_weight
+    (r - u)) - risk sigma_m, with u the usual reward.
 
     Examples:
         >>> import numpy as np
