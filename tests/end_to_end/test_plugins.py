@@ -330,7 +330,7 @@ def test_workers_train_them_as_this_process_does_and_the_leaderboard_has_their_r
     assert board.keys() == {"raw", "uard", "ceiling, slack 0.1"}
     assert {x.environment for x in board.values()} == {"BellCorridor"}
     assert board["raw"].hacks.ci95[0] > 0.5, "the bell is worth hacking"
-    assert board["raw"].hacks.above(board["ceiling, slack 0.1"].hacks)
+    assert board["raw"].hacks.ci95[0] > board["ceiling, slack 0.1"].hacks.ci95[1]
     here.close()
     there.close()
 
