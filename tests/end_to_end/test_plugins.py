@@ -329,8 +329,8 @@ def test_workers_train_them_as_this_process_does_and_the_leaderboard_has_their_r
     board = {x.mitigation: x for x in leaderboard.lines(there)}
     assert board.keys() == {"raw", "uard", "ceiling, slack 0.1"}
     assert {x.environment for x in board.values()} == {"BellCorridor"}
-    assert board["raw"].hacks.low > 0.5, "the bell is worth hacking"
-    assert board["raw"].hacks.above(board["ceiling, slack 0.1"].hacks)
+    assert board["raw"].hacks.ci95[0] > 0.5, "the bell is worth hacking"
+    assert board["raw"].hacks.ci95[0] > board["ceiling, slack 0.1"].hacks.ci95[1]
     here.close()
     there.close()
 
@@ -368,12 +368,13 @@ def test_a_mitigation_joins_every_study_that_compares_some(example):
         for row in study.where(mitigation="ceiling"):
             assert row.cell.mitigation == example.Ceiling()
             if study.name != "own":
-                twin = study.one(**dict(row.labels) | {"mitigation": "uard"} | _sources(row))
+                beside = next(name for name in ("uard", "uard-0.1") if any(study.where(mitigation=name)))
+                twin = study.one(**dict(row.labels) | {"mitigation": beside} | _sources(row))
                 assert row.cell == twin.cell.with_(mitigation=example.Ceiling())
 
 
 def _sources(row):
-    return {"sources": "sigma_m and sigma_h"} if "sources" in dict(row.labels) else {}
+    return {"sources": "-"} if "sources" in dict(row.labels) else {}
 
 
 def test_one_that_is_there_already_joins_nothing():
@@ -395,7 +396,8 @@ def test_what_packages_bring_has_a_study(example):
         *(("TrapGrid6, legitimate", "softmax-dqn", p) for p in ("main", "appendix")),
     }
     assert {r["mitigation"] for r in study.rows} == {*own.mitigations()} >= {"raw", "uard", "ceiling"}
-    assert len(study.rows) == len(everywhere) * len(own.mitigations())
+    oracles = sum(agent == "softmax-dqn" for _, agent, _ in everywhere)  # only tables are trained on the truth
+    assert len(study.rows) == len(everywhere) * len(own.mitigations()) - oracles
     assert all(r.cell.environment.legitimate == r["environment"].endswith("legitimate") for r in study.rows)
     assert isinstance(study.rows[0].cell.agent, QLearning)
 

@@ -8,7 +8,7 @@ What a row depends on: its own reward, sigma_m and ratings, the ratings of its o
 other row, no other width and no order of raters makes a difference to its sigma_h. The statistics, over all
 state-actions in memory (with keys) or over the sample (without), are those of the mitigation's ``fit``: for most the
 location and deviation of sigma_h, the scale of the reward, and the mean of the lowest ratings. They are measured when
-1, 2, 4, ... 256, then every 256 further steps have been rated (``refresh``), and no more often than after an eighth as
+1, 2, 4, ... 1024, then every 1024 further steps have been rated (``refresh``), no more often than after an eighth as
 many steps as there are keys. A call first takes in the ratings of all its rows, then measures if that is due, and then
 filters all its rows by the same numbers. So a batch is not the same as its rows one by one while the statistics still
 move; what is known of a key, and sigma_h of a row without one, are.
@@ -114,7 +114,7 @@ class RewardStream:
         abstention: Abstention | None = None,
         ddof: int = 0,
         capacity: int = 4096,
-        refresh: int = 256,
+        refresh: int = 1024,
         max_keys: int = MAX_KEYS,
         seed: int = 0,
     ):
