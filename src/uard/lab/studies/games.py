@@ -22,6 +22,9 @@ GAMES = {
     )
 }
 EPISODES = 100
+# Rules that ask who said what, and the model of version 0.1 with which all others were trained here so far.
+BY_RATER = ("uard", "median", "min-proxy-mean", "min-proxy-median", "excess")
+RATINGS = RatingModel(predicts="ratings")
 
 
 def gaming() -> tuple[Row, ...]:
@@ -38,7 +41,11 @@ def gaming() -> tuple[Row, ...]:
                 named(mitigation),
                 agent,
                 episodes=EPISODES,
-                rating_model=None if isinstance(agent, QLearning) else RatingModel(),
+                rating_model=None
+                if isinstance(agent, QLearning)
+                else RatingModel()
+                if mitigation in BY_RATER
+                else RATINGS,
             ),
             game=where,
             agent=name,
