@@ -153,54 +153,6 @@ def pooled(p: Published, robot: str, agent: str, mitigation: str) -> tuple[np.nd
     return 1.0 - ours[0] / raw[0], ours[1] / honest[1]
 
 
-def headline(p: Published) -> str:
-    """Say in a few sentences what PPO does in the tasks that lie, also under noise; the README quotes it."""
-    lies = [r for r in p.rows(HACKING, agent="ppo") if r["region"] != "none"]
-    raw, ours = ([p.of(r, "hacks").mean for r in lies if r["mitigation"] == m] for m in ("raw", "uard-0.1"))
-    kept = {
-        m: " and ".join(
-            f"{summary(100 * found[1])} % ({robot})"
-            for robot in ("hopper", "walker2d")
-            if (found := pooled(p, robot, "ppo", m)) is not None
-        )
-        for m in ("uard-0.1", "uard-paper")
-    }
-    noisy = p.studies[NOISE].one(agent="ppo", mitigation="uard-0.1", noise=0.3)
-    hopper = p.rows(HACKING, robot="hopper", agent="ppo")
-    (honest,) = (r for r in hopper if (r["region"], r["mitigation"]) == ("vibration", "true reward"))
-    plain = {r["mitigation"]: r for r in hopper if r["region"] == "none"}
-    _, by_sac = pooled(p, "hopper", "sac", "uard-0.1") or (None, None)
-    sac = f" SAC on Hopper keeps {summary(100 * by_sac)} % ({len(by_sac)} seeds)." if by_sac is not None else ""
-    return (
-        f"PPO on the raw reward spends {min(raw):.0f} to {max(raw):.0f} steps of an episode where the reward lies, with "
-        f"`uard-0.1` at most {number(max(ours))}. Over all settings of a robot `uard-0.1` keeps {kept['uard-0.1']} of the true return of "
-        f"the agent trained on the true reward; as printed, {kept['uard-paper']}. "
-        f"With noise of 30 % of the bonus on every rating (Hopper, vibration) it spends "
-        f"{summary(p.per_seed(noisy, 'hacks'))} steps where the reward lies and has a true return of "
-        f"{summary(p.per_seed(noisy, 'true_return'))}; the honest agent has {summary(p.per_seed(honest, 'true_return'))}. "
-        f"Without a lie (Hopper, {len(p.seeds_of(plain['uard-0.1']))} seeds) its true return is "
-        f"{summary(p.per_seed(plain['uard-0.1'], 'true_return'))}, the raw agent's {summary(p.per_seed(plain['raw'], 'true_return'))}."
-        f"{sac}{_others(p)}"
-    )
-
-
-def _others(p: Published) -> str:
-    parts, seeds = [], 0
-    for agent in dict.fromkeys(agent for _, agent in _settings(p) if agent not in ("ppo", "sac")):
-        found = [pooled(p, robot, agent, "uard-0.1") for robot in ("hopper", "walker2d")]
-        whole = [(100 * removed.mean(), 100 * kept.mean()) for removed, kept in filter(None, found)]
-        if len(whole) == len(found):
-            removed, kept = zip(*whole, strict=True)
-            seeds = max(seeds, *(len(f[0]) for f in found if f))
-            parts.append(f"{agent} {min(removed):.1f} and {min(kept):.0f} %")
-    if not parts:
-        return ""
-    return (
-        f" Other agents ({seeds} seed{'s' * (seeds > 1)}, the worse robot): of the raw agent's hacks `uard-0.1` removes, and of "
-        f"the honest agent's true return it keeps, {'; '.join(parts)}."
-    )
-
-
 def _settings(p: Published) -> list[tuple[str, str]]:
     return list(dict.fromkeys((r["robot"], r["agent"]) for r in p.rows(HACKING)))
 

@@ -286,6 +286,16 @@ def tables(found: Sequence[Regrets]) -> list[Table]:
     return [made(these) for these in found for made in (main_table, by_kind, worst_table)]
 
 
+def headline(found: Sequence[Regrets]) -> str:
+    """Return the regrets as a Markdown table, a line for each mitigation; the README quotes it."""
+    names = sorted(found[0].regret, key=lambda name: found[0].regret[name].mean())
+    columns = [f"{these.tasks} ({len(these.scenarios)})" for these in found]
+    lines = [("mitigation", *columns), ("---",) * (1 + len(found))]
+    for name in names:
+        lines.append((f"`{name}`", *(_interval(statistics.summarise(these.regret[name])) for these in found)))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
 def section(study: Study, found: Sequence[Regrets], seeds: int) -> Section:
     """Return the part of the report: what beats ours first, then tables and a figure.
 

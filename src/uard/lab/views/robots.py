@@ -91,12 +91,12 @@ def _share(p: Published, r: Row, reference: Row | None) -> str:
 def _table(p: Published, s: Setting) -> Table:
     rows = []
     for r in s.rows:
-        hacks, true = (p.of(r, metric) for metric in ("hacks", "true_return"))
+        hacks = p.of(r, "hacks")
         rows.append(
             (
                 r["mitigation"],
                 f"{number(hacks.mean)}{bounds(hacks.ci95)}",
-                f"{number(true.mean)}{bounds(true.ci95)}",
+                _true(p, r),
                 _share(p, r, s.one("true reward")),
                 _share(p, r, s.plain),
                 str(len(p.seeds_of(r))),
@@ -128,6 +128,32 @@ def _noise(p: Published) -> list[Table]:
     columns = ("learns from", *(f"noise {100 * x:g} %" for x in shares))
     note = "True return (hacks) per episode, means; noise of every rater as a share of the bonus."
     return [Table("hopper, a lie about crouch, main panel with more noise", columns, tuple(lines), 1, note)]
+
+
+def headline(p: Published) -> str:
+    """Say in a sentence for each finished setting what it came to; the README quotes it."""
+    out = []
+    for s in settings(p):
+        ours, raw, honest = (s.one(name) for name in (OURS, "raw", "true reward"))
+        if ours is None or raw is None:
+            continue
+        simple = [r for name in SIMPLE if (r := s.one(name)) is not None]
+        what = "; ".join(f"{r['mitigation']} {_true(p, r)}" for r in simple)
+        if s.region == "none":
+            out.append(f"{s.name}: true return {_true(p, ours)}, raw {_true(p, raw)}; {what}.")
+        elif honest is not None:
+            hacks = [number(p.of(r, "hacks").mean) for r in (raw, ours, honest)]
+            true = [_true(p, r) for r in (raw, ours, honest)]
+            out.append(
+                f"{s.name}: hacks per episode {hacks[0]} on the raw reward, {hacks[1]} with `uard`, {hacks[2]} on the true "
+                f"reward; true return {true[0]}, {true[1]}, {true[2]}; {what}."
+            )
+    return " ".join(out)
+
+
+def _true(p: Published, r: Row) -> str:
+    found = p.of(r, "true_return")
+    return f"{number(found.mean)}{bounds(found.ci95)}"
 
 
 def losses(p: Published) -> list[str]:
