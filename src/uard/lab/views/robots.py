@@ -145,8 +145,8 @@ def headline(p: Published) -> str:
             hacks = [number(p.of(r, "hacks").mean) for r in (raw, ours, honest)]
             true = [_true(p, r) for r in (raw, ours, honest)]
             out.append(
-                f"{s.name}: hacks per episode {hacks[0]} on the raw reward, {hacks[1]} with `uard`, {hacks[2]} on the true "
-                f"reward; true return {true[0]}, {true[1]}, {true[2]}; {what}."
+                f"{s.name}: hacks per episode {hacks[0]} on the raw reward, {hacks[1]} with `uard`, {hacks[2]} on the "
+                f"true reward; true return {true[0]}, {true[1]}, {true[2]}; {what}."
             )
     return " ".join(out)
 
