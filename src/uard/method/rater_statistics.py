@@ -151,7 +151,9 @@ def of_raters(statistics: RaterStatistics, raters: int) -> RaterStatistics:
         raters: How many are there now.
     """
     known = statistics.noise.shape[0]
-    if known >= raters:
+    if known == raters:
+        return statistics
+    if known > raters:
         return statistics._replace(**{name: getattr(statistics, name)[:raters] for name in PER_RATER})
     xp = namespace(statistics.noise)
     one = xp.ones_like(statistics.noise[:1])
