@@ -46,7 +46,7 @@ from uard.training.episode_log import LOG
 GRID = paper_grid(10)
 AGENT = QLearning(heads=5)
 EPISODES = 500
-MITIGATIONS = ("raw", "uard", "lcb", "worst-of-annotations", "uard-paper")
+MITIGATIONS = ("raw", "uard", "uard-0.1", "median", "lcb", "worst-of-annotations", "uard-paper")
 PYTHON, C, C_MASKS = "Python + Gymnasium, raw", "C, raw, leanest", "C, raw, with masks"
 
 C_SOURCE = r"""
@@ -267,6 +267,7 @@ def ratios(runs: dict[str, list[Run]]) -> Iterator[dict[str, Any]]:
         ("leanest C / fused raw", C, raw, "<=", 3.0),
         ("C with masks / fused raw", C_MASKS, raw, "<=", 3.0),
         ("fused raw / fused uard: its cost", raw, "fused, uard", "<=", 3.0),
+        ("fused raw / fused uard-0.1: its cost", raw, "fused, uard-0.1", "<=", 3.0),
     ]
     for label, above, below, sense, bound in promised:
         if above not in runs or below not in runs:

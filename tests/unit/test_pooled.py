@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from uard import Evidence, Feedback, InvalidValueError
 from uard.method import pooled, rater_statistics
+from uard.method.arrays import smallest
 from uard.method.feedback import ByRater
 from uard.method.mitigations import ExcessDisagreement, PooledDiscounting, Witness, named
 from uard.ratings.aggregate import aggregate
@@ -356,3 +357,16 @@ def test_it_is_made_by_name_and_checked():
     feedback = feedback_of(*panel_data(0))._replace(by_rater=None)
     with pytest.raises(InvalidValueError, match="by_rater"):
         PooledDiscounting().fit(feedback, feedback.count > 0)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 400])
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_order_statistics_are_those_of_a_sort(size, library):
+    """In JAX nothing is sorted: few values are compared with each other, of many the bits are halved."""
+    values = np.random.default_rng(size).integers(-4, 5, (size, 3)).astype(np.float32)  # with ties and zeros
+    values[:, 2] = np.random.default_rng(0).normal(size=size) * 10.0 ** np.random.default_rng(1).integers(-30, 30, size)
+    convert, ranked = LIBRARIES[library], np.sort(values, axis=0)
+    for first in {0, size // 3, size - 1}:
+        count = min(3, size - first)
+        found = smallest(convert(values), convert(np.full((1, 3), first)), axis=0, count=count)
+        np.testing.assert_array_equal(np.asarray(found), ranked[first : first + count])

@@ -107,23 +107,23 @@ def pool(
     xp = namespace(said)
     sums = _sums(said, reward, here, variance)
     tau2 = _variance_between(sums)
-    zero = xp.zeros_like(tau2)
     shrunk = 1.0 + tau2[..., None] * sums.weight
     weight = sums.weight / shrunk  # 1 / (v + tau^2)
-    total, first = xp.sum(weight, axis=-1), xp.sum(weight * sums.gap, axis=-1)
+    first = weight * sums.gap
+    total, first, second = weight.sum(-1), first.sum(-1), (sums.first - first) * sums.gap
     anybody = total > 0
-    precision = xp.where(anybody, total, zero + 1.0)
+    precision = xp.where(anybody, total, 1.0)
     gap = first / precision
     # Both hypotheses' squares are about the reward: those about the centre are total * gap^2 less.
-    squares = xp.sum((sums.weight - weight) * sums.gap * sums.gap, axis=-1) + first * gap
-    determinants = xp.sum(xp.log(shrunk), axis=-1) + xp.log(1.0 + span * span * total)
+    squares = second.sum(-1) + first * gap
+    determinants = xp.log(shrunk).sum(-1) + xp.log(1.0 + span * span * total)
     return Pool(
         heard=sums.heard,
-        centre=xp.where(anybody, reward + gap, zero),
+        centre=xp.where(anybody, reward + gap, 0.0),
         tau=root(tau2),
-        error=xp.where(anybody, 1.0 / xp.sqrt(precision), zero),
-        lowest=xp.where(anybody, reward + xp.min(xp.where(here, sums.gap, xp.inf), axis=-1), zero),
-        log_odds=xp.where(anybody, 0.5 * (squares - determinants), zero),
+        error=xp.where(anybody, 1.0 / xp.sqrt(precision), 0.0),
+        lowest=xp.where(anybody, reward + xp.min(xp.where(here, sums.gap, xp.inf), axis=-1), 0.0),
+        log_odds=xp.where(anybody, 0.5 * (squares - determinants), 0.0),
     )
 
 
@@ -206,18 +206,17 @@ def precise_mean(
     """
     xp = namespace(said)
     sums = _sums(said, xp.zeros_like(said[..., 0]), here, variance)
-    return sums.first / xp.where(sums.heard > 0, sums.total, xp.ones_like(sums.total))
+    return sums.first.sum(-1) / xp.where(sums.heard > 0, sums.total, 1.0)
 
 
 class _Sums(NamedTuple):
-    """Sums over the raters who are heard of what they say beyond something, weighed by the inverse variances."""
+    """What raters who are heard say beyond something, weighed by the inverse variances; sums over them."""
 
     heard: Float[Array, "*batch"]
     weight: Float[Array, "*batch K"]
     gap: Float[Array, "*batch K"]
+    first: Float[Array, "*batch K"]
     total: Float[Array, "*batch"]
-    first: Float[Array, "*batch"]
-    second: Float[Array, "*batch"]
 
 
 def _sums(
@@ -227,19 +226,17 @@ def _sums(
     variance: Float[Array, "*batch K"],
 ) -> _Sums:
     xp = namespace(said)
-    zero = xp.zeros_like(said)
-    weight, gap = xp.where(here, 1.0 / variance, zero), xp.where(here, said - about[..., None], zero)
-    first = weight * gap
-    heard = xp.sum(xp.astype(here, said.dtype), axis=-1)
-    return _Sums(heard, weight, gap, xp.sum(weight, axis=-1), xp.sum(first, axis=-1), xp.sum(first * gap, axis=-1))
+    weight, gap = xp.where(here, 1.0 / variance, 0.0), xp.where(here, said - about[..., None], 0.0)
+    # The method, not xp.sum, for speed: streams of one step live here.
+    return _Sums(here.sum(-1, dtype=said.dtype), weight, gap, weight * gap, weight.sum(-1))
 
 
 def _variance_between(s: _Sums) -> Float[Array, "*batch"]:
     xp = namespace(s.total)
-    zero = xp.zeros_like(s.total)
     several = s.heard > 1.0
-    total = xp.where(several, s.total, zero + 1.0)
-    excess = xp.maximum(s.second - s.first * s.first / total - (s.heard - 1.0), zero)
-    squares = xp.sum(s.weight * (s.weight / total[..., None]), axis=-1)  # no square: of tiny rewards it overflows
-    spread = xp.where(several, total - squares, zero + 1.0)
-    return xp.where(several, excess / spread, zero)
+    total = xp.where(several, s.total, 1.0)
+    first, second = s.first.sum(-1), (s.first * s.gap).sum(-1)
+    excess = second - first * first / total - (s.heard - 1.0)
+    squares = (s.weight * (s.weight / total[..., None])).sum(-1)  # no square: of tiny rewards it overflows
+    spread = xp.where(several, total - squares, 1.0)
+    return xp.where(several & (excess > 0), excess / spread, 0.0)

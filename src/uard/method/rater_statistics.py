@@ -151,7 +151,9 @@ def of_raters(statistics: RaterStatistics, raters: int) -> RaterStatistics:
         raters: How many are there now.
     """
     known = statistics.noise.shape[0]
-    if known >= raters:
+    if known == raters:
+        return statistics
+    if known > raters:
         return statistics._replace(**{name: getattr(statistics, name)[:raters] for name in PER_RATER})
     xp = namespace(statistics.noise)
     one = xp.ones_like(statistics.noise[:1])
@@ -272,15 +274,15 @@ def leave_one_out_medians(
     xp = namespace(said)
     values = xp.concat([reward[:, None], xp.where(here, said, xp.full_like(said, xp.finfo(said.dtype).max))], axis=-1)
     left = _number(here, axis=-1)  # how many values there are, with the reward and without the rater
-    last = values.shape[-1] - 1
-    low, high = xp.maximum(left - 1, 0 * left) // 2, left // 2
-    ranked = smallest(values, xp.clip(xp.concat([low, low + 1, high, high + 1], axis=-1), 0, last), axis=-1)
+    ranked = smallest(values, xp.maximum(left - 1, 0 * left) // 2, axis=-1, count=3)
 
-    def without(first: int) -> Float[Array, "n K"]:
-        here, following = ranked[:, first : first + 1], ranked[:, first + 1 : first + 2]
-        return xp.where(said > here, here, following)
+    def without(index: int) -> Float[Array, "n K"]:
+        this, following = ranked[:, index : index + 1], ranked[:, index + 1 : index + 2]
+        return xp.where(said > this, this, following)
 
-    return xp.where(here, 0.5 * without(0) + 0.5 * without(2), xp.zeros_like(said))
+    low = without(0)
+    high = xp.where(left % 2 == 0, without(1), low)
+    return xp.where(here, 0.5 * low + 0.5 * high, xp.zeros_like(said))
 
 
 def masked_median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis: int = 0) -> Float[Array, "*rest"]:
@@ -291,8 +293,10 @@ def masked_median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis:
         >>> float(masked_median(np.array([1.0, 3.0, 4.0, 99.0]), np.array([True, True, True, False])))
         3.0
     """
-    number = _number(mask, axis)
-    return _median(values, mask, namespace(number).concat([(number - 1) // 2, number // 2], axis=axis), axis)
+    xp, number = namespace(values), _number(mask, axis)
+    middles = _middles(values, mask, number, axis, count=2)
+    low, high = (xp.take(middles, xp.asarray([i]), axis=axis) for i in (0, 1))
+    return xp.squeeze(xp.where(number % 2 == 0, 0.5 * low + 0.5 * high, low), axis=axis)
 
 
 def lower_median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis: int = 0) -> Float[Array, "*rest"]:
@@ -303,7 +307,7 @@ def lower_median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], axis: 
         >>> float(lower_median(np.array([1.0, 3.0, 4.0, 99.0]), np.array([True, True, False, False])))
         1.0
     """
-    return _median(values, mask, (_number(mask, axis) - 1) // 2, axis)
+    return namespace(values).squeeze(_middles(values, mask, _number(mask, axis), axis, count=1), axis=axis)
 
 
 def _number(mask: Bool[Array, "*any"], axis: int) -> Array:
@@ -311,10 +315,9 @@ def _number(mask: Bool[Array, "*any"], axis: int) -> Array:
     return xp.sum(xp.astype(mask, xp.int64 if hasattr(mask, "detach") else xp.int32), axis=axis, keepdims=True)
 
 
-def _median(values: Float[Array, "*any"], mask: Bool[Array, "*any"], index: Array, axis: int) -> Float[Array, "*rest"]:
-    """Return the mean of the order statistics of the masked-in values at these indices, 0 where there are no values."""
+def _middles(values: Float[Array, "*any"], mask: Bool[Array, "*any"], number: Array, axis: int, count: int) -> Array:
+    """Return the lower of the two middle masked-in values and, asked for two, the next; 0 where there are none."""
     xp = namespace(values)
-    top = xp.full_like(values, xp.finfo(values.dtype).max)
-    found = smallest(xp.where(mask, values, top), xp.maximum(index, 0 * index), axis)
-    middle = xp.sum(found / found.shape[axis], axis=axis)
-    return xp.where(xp.any(mask, axis=axis), middle, xp.zeros_like(middle))
+    held = xp.where(mask, values, xp.full_like(values, xp.finfo(values.dtype).max))
+    found = smallest(held, xp.maximum(number - 1, 0 * number) // 2, axis, count)
+    return xp.where(number > 0, found, xp.zeros_like(found))

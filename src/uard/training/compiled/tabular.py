@@ -25,8 +25,9 @@ from uard.training.episode_log import LOG
 from uard.training.tracing import traceable
 
 CHUNK = 512  # steps whose random numbers are drawn together; the panel's statistics are measured once a chunk, or,
-# where a rule asks for them early, whenever the number of steps has doubled: so in the first chunk, at
+# where a rule asks for them early, whenever the number of steps has doubled, in the first chunk at
 DOUBLED = np.array([0, *(2**i for i in range(CHUNK.bit_length()))])  # its end is the last
+RARELY = 4  # and then in every so many chunks
 ROOM = 64  # a program has room for this many runs, or a multiple
 
 
@@ -272,7 +273,7 @@ def train_one(run: Run, program: Program) -> TrainedTables:
         else:
             if doubles:
                 chunks = number - 1
-                fits = (chunks & (chunks - 1)) == 0
+                fits = ((chunks & (chunks - 1)) == 0) | (chunks % RARELY == 0)
                 c = c._replace(statistics=lax.cond(fits, panel_statistics, lambda rows: c.statistics, c.rows))
             elif asks_raters:
                 c = c._replace(statistics=panel_statistics(c.rows))
