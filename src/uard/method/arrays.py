@@ -7,6 +7,7 @@ plain number; functions of several broadcast them.
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -83,9 +84,7 @@ def _by_rank(values: Array, first: Array, count: int) -> Array:
 
 def _by_bisection(values: Array, first: Array, count: int) -> Array:
     """Halve the range of the floats' bits, in which they are ordered, until one float is left."""
-    from jax import lax
-
-    xp = namespace(values)
+    xp, lax = namespace(values), sys.modules["jax"].lax  # it is loaded where values are JAX's, but not imported here
     kind = xp.int64 if values.dtype.itemsize == 8 else xp.int32
     limits = xp.iinfo(kind)
     bits = lax.bitcast_convert_type(lax.stop_gradient(values), kind)
@@ -101,8 +100,7 @@ def _by_bisection(values: Array, first: Array, count: int) -> Array:
         return xp.where(enough, low, middle + 1), xp.where(enough, middle, high)
 
     ends = xp.full(first.shape, limits.min, kind), xp.full(first.shape, limits.max, kind)
-    loops: Any = lax  # whose types are not all known
-    found = loops.fori_loop(0, limits.bits, halve, ends)[0]
+    found = lax.fori_loop(0, limits.bits, halve, ends)[0]
     out: list[Array] = []
     for i in range(count):
         if i:
