@@ -24,10 +24,9 @@ from uard.training.compiled import runs
 from uard.training.episode_log import LOG
 from uard.training.tracing import traceable
 
-CHUNK = 512  # steps whose random numbers are drawn together; the panel's statistics are measured once a chunk, or,
-# where a rule asks for them early, whenever the number of steps has doubled, in the first chunk at
+CHUNK = 512  # steps whose random numbers are drawn together; the panel's statistics are measured once a chunk, and,
+# where a rule asks for them early, in the first chunk whenever the number of steps has doubled
 DOUBLED = np.array([0, *(2**i for i in range(CHUNK.bit_length()))])  # its end is the last
-RARELY = 4  # and then in every so many chunks
 ROOM = 64  # a program has room for this many runs, or a multiple
 
 
@@ -271,11 +270,7 @@ def train_one(run: Run, program: Program) -> TrainedTables:
             bounds = jnp.asarray(DOUBLED[:-1]), jnp.asarray(DOUBLED[1:])
             c, _ = lax.scan(lambda c, steps: (fit_and_go(c, draws, steps), None), c, bounds)
         else:
-            if doubles:
-                chunks = number - 1
-                fits = ((chunks & (chunks - 1)) == 0) | (chunks % RARELY == 0)
-                c = c._replace(statistics=lax.cond(fits, panel_statistics, lambda rows: c.statistics, c.rows))
-            elif asks_raters:
+            if asks_raters:
                 c = c._replace(statistics=panel_statistics(c.rows))
             c, _ = lax.scan(one_step, c, draws)
         if program.snapshots:
