@@ -238,5 +238,6 @@ def _variance_between(s: _Sums) -> Float[Array, "*batch"]:
     first, second = s.first.sum(-1), (s.first * s.gap).sum(-1)
     excess = second - first * first / total - (s.heard - 1.0)
     squares = (s.weight * (s.weight / total[..., None])).sum(-1)  # no square: of tiny rewards it overflows
-    spread = xp.where(several, total - squares, 1.0)
-    return xp.where(several & (excess > 0), excess / spread, 0.0)
+    spread = total - squares
+    several = several & (spread > 0)  # where one rater outweighs all others by more than a float can tell it is not
+    return xp.where(several & (excess > 0), excess / xp.where(several, spread, 1.0), 0.0)

@@ -98,7 +98,7 @@ class RewardStream:
         >>> for _ in range(30):
         ...     out = stream(reward, ratings, keys=range(10))
         >>> out.weight[:2].round(2).tolist(), out.reward[:2].round(2).tolist()
-        ([0.03, 0.94], [-0.8, -0.1])
+        ([0.0, 1.0], [-1.25, -0.1])
 
     Attributes:
         mitigation: What is done with a reward.

@@ -125,7 +125,7 @@ class UncertaintyDiscountedReward:
         >>> reward = UncertaintyDiscountedReward([length, clarity])
         >>> learned = reward(["why?"] * 3, ["so", "therefore", "um, um, therefore"])
         >>> [f"{x:.1f}" for x in reward.last.raw], [f"{x:.1f}" for x in learned]
-        (['-0.2', '0.3', '-0.1'], ['-0.5', '0.3', '-1.3'])
+        (['-0.2', '0.3', '-0.1'], ['-0.5', '0.1', '-0.8'])
 
     Attributes:
         judges: The judges by name.

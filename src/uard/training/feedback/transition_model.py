@@ -294,8 +294,8 @@ def distinct(reward: Array, seen: Array) -> tuple[Array, Array]:
     one = here.astype(jnp.float32)
     weight = one / jnp.maximum(jnp.bincount(place, one, length=BINS), 1.0)[place]
     total = jnp.cumsum(weight)
-    chosen = jnp.searchsorted(total, total[-1] * (jnp.arange(SPREAD) + 0.5) / SPREAD)
-    return chosen, (seen > 0) & (jnp.diff(chosen, prepend=-1) > 0)
+    chosen = jnp.searchsorted(total, total[-1] * (jnp.arange(SPREAD, dtype=jnp.float32) + 0.5) / SPREAD)
+    return chosen, (seen > 0) & (jnp.diff(chosen, prepend=-jnp.ones_like(chosen[:1])) > 0)
 
 
 def expecting(statistics: Any, feedback: Feedback) -> Any:
