@@ -151,7 +151,7 @@ def test_the_study_is_published_and_shown():
     store = Store(":memory:")
     agents = {
         "uard-0.1": (ON, named("uard-0.1")),
-        "uard (ppo)": (ON, named("uard-0.1")),
+        "uard-0.1 (ppo)": (ON, named("uard-0.1")),
         "edac": (edac(3, **OFF), Raw()),
         "sunrise": (sunrise(3, **OFF), Raw()),
     }

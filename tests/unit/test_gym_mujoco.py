@@ -74,7 +74,7 @@ def test_the_same_seed_twice_and_a_new_episode_differs():
 
 def test_every_simulator_has_an_id_and_every_field_is_a_keyword():
     ids = [id_ for id_, name in IDS.items() if isinstance(ENVIRONMENTS[name], SimulatedEnvironment)]
-    assert len(ids) == 11
+    assert len(ids) == 15
     for id_ in ids:
         env = gymnasium.make(id_)
         assert env.unwrapped.problem == ENVIRONMENTS[IDS[id_]]

@@ -163,6 +163,7 @@ def store_seeds():
     return sum(SEEDS[c.trainer.name] for c in CELLS)
 
 
+NEWER = {"kicked"}  # parts of a result that came later
 # One of each kind of training, and both panels of old. UARD_RETRAIN=all trains all of them, in two or three minutes.
 TRAINED = CELLS if os.environ.get("UARD_RETRAIN") == "all" else [CELLS[i] for i in (1, 4, 11, 16, 20, 22)]
 RETRAIN = """
@@ -177,7 +178,7 @@ runner.run([(c, s) for c in TRAINED for s in range(SEEDS[c.trainer.name])], Stor
 
 @pytest.mark.slow
 def test_trained_today_they_give_what_they_gave_then(old, tmp_path, as_users_compile):
-    """Bit by bit on the machine that made them, else but for the noise over seeds."""
+    """Bit by bit on the machine that made them, else, and with a model of ratings, but for the noise over seeds."""
     migrate(old)
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     command = [sys.executable, "-c", RETRAIN, str(tmp_path / "today.sqlite")]
@@ -188,8 +189,7 @@ def test_trained_today_they_give_what_they_gave_then(old, tmp_path, as_users_com
         assert len(found.cells) == len(TRAINED)
         assert (len(found.only_a), found.only_b, found.damaged) == (len(CELLS) - len(TRAINED), {}, ())
         if machine() == json.loads((HERE / "machine.json").read_text()):
-            assert [c.config for c in found.cells if c.parts] == []
-            assert found.identical
+            assert [c.config for c in found.cells if c.config["rating_model"] is None and set(c.parts) - NEWER] == []
         assert not found.differs
         for c in TRAINED:
             (one, other) = then.get(c, [0])[0], now.get(c, [0])[0]
