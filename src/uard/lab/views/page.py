@@ -52,7 +52,7 @@ def write(
     ours = [
         _ours(results),
         *_panels(),
-        *robots.section(published.packaged()),
+        *robots.section(robots.published()),
         _games(),
         _best_of_n(),
         _made(store, len(results.seeds)),

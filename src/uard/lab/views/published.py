@@ -376,7 +376,7 @@ def broken() -> list[PluginError]:
     return brought("results", _checked)[1]
 
 
-_OWN = ResultFiles(resources.files("uard.lab.published"), ("games.json",))  # and panels.json, once it is there
+_OWN = ResultFiles(resources.files("uard.lab.published"), ("games.json", "panels.json"))
 
 
 def _places() -> list[ResultFiles]:

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from uard.lab.statistics import Family
+from uard.lab.studies import robots
 from uard.lab.study import Row
-from uard.lab.views.published import Published
+from uard.lab.views.published import Published, packaged_json
 from uard.lab.views.sections import Section
 from uard.lab.views.tables import Table, bounds, number
 from uard.lab.views.templates import table
@@ -45,6 +46,11 @@ class Setting:
     def one(self, mitigation: str) -> Row | None:
         """Return the row of a mitigation, if it was published."""
         return next((r for r in self.rows if r["mitigation"] == mitigation), None)
+
+
+def published() -> Published:
+    """Return what was published of these studies, of their own seeds; other studies share some of the cells."""
+    return Published(robots.studies(), [packaged_json("robots.json")])
 
 
 def settings(p: Published) -> Iterator[Setting]:
