@@ -75,6 +75,9 @@ def panel(*columns):
     return {f"judge {i}": says(column) for i, column in enumerate(columns)}
 
 
+by_the_old_rule = functools.partial(UncertaintyDiscountedReward, mitigation=named("uard-0.1"))  # of numbers by hand
+
+
 def ask(reward, size, prompts=None, **kwargs):
     return reward(prompts=prompts or ["p"] * size, completions=["c"] * size, **kwargs)
 
@@ -89,7 +92,7 @@ def test_an_outlier_is_drawn_to_the_lowest_judge():
     # Three completions on which all judges say 1, one on which they say 0, 0, 3: its mean is 1 too. sigma_h^2 over
     # ratings and mean = (1 + 1 + 4 + 0) / 4 = 1.5; sigma_h is s, 0, 0, 0: mean s/4, mean deviation 3/8 s, so z = 2 and
     # lambda = 0.2 (1 + 50) = 10.2. The mean never varies, so its unit is 1: w = 1 / (1 + 10.2 * 0.5 * s); b = 0.
-    reward = UncertaintyDiscountedReward(panel([1, 1, 1, 0], [1, 1, 1, 0], [1, 1, 1, 3]), scales=AS_THEY_ARE)
+    reward = by_the_old_rule(panel([1, 1, 1, 0], [1, 1, 1, 0], [1, 1, 1, 3]), scales=AS_THEY_ARE)
     weight = 1 / (1 + 5.1 * 1.5**0.5)
     assert ask(reward, 4) == pytest.approx([1, 1, 1, weight])
     assert reward.last.sigma_h == pytest.approx([0, 0, 0, 1.5**0.5])
@@ -102,7 +105,7 @@ def test_an_outlier_is_drawn_to_the_lowest_judge():
 def test_scores_come_to_one_scale():
     # 1, 3 have mean 2 and deviation 1; with 5 they have mean 3 and variance 8/3. The second judge says the same
     # hundredfold and shifted.
-    reward = UncertaintyDiscountedReward({"a": says([1, 3], [5]), "b": says([107, 307], [507])})
+    reward = by_the_old_rule({"a": says([1, 3], [5]), "b": says([107, 307], [507])})
     assert ask(reward, 2) == pytest.approx([-1, 1])
     assert ask(reward, 1) == pytest.approx([2 / (8 / 3) ** 0.5])
     np.testing.assert_allclose(reward.last.ratings, [[1.5**0.5, 1.5**0.5]])
@@ -140,11 +143,11 @@ def test_any_mitigation_of_rewards():
 
 def test_doubt_of_an_ensemble():
     # The judges agree, so only sigma_m counts: w = 1 / (1 + 0.2 * 0.5 * sigma_m / unit), unit = deviation of 1, 3.
-    given = UncertaintyDiscountedReward(panel([1, 3], [1, 3]), sigma_m=says([0, 20]), scales=AS_THEY_ARE[:2])
+    given = by_the_old_rule(panel([1, 3], [1, 3]), sigma_m=says([0, 20]), scales=AS_THEY_ARE[:2])
     ask(given, 2)
     assert given.last.weight == pytest.approx([1, 1 / 3])
     # Members say 0, 0 and 0, 4: deviation of all four sqrt(3), of the last two sqrt(8).
-    heads = UncertaintyDiscountedReward(panel([1, 3], [1, 3]), sigma_m=says([[0, 0], [0, 4]]))
+    heads = by_the_old_rule(panel([1, 3], [1, 3]), sigma_m=says([[0, 0], [0, 4]]))
     ask(heads, 2)
     assert heads.last.sigma_m == pytest.approx([0, (8 / 3) ** 0.5])
 
@@ -155,7 +158,7 @@ def test_doubt_of_an_ensemble():
 def test_missing_scores_are_counted_and_change_nothing_for_the_others():
     logged = {}
     scores = ([0, 2, None, None], [0.0, 2.0, float("nan"), 7.0], np.array([0.0, 2.0, np.nan, np.nan]))
-    reward = UncertaintyDiscountedReward(panel(*scores), scales=AS_THEY_ARE)
+    reward = by_the_old_rule(panel(*scores), scales=AS_THEY_ARE)
     with pytest.warns(UnscoredWarning, match="no judge scored completion 2 \\(1 of 4"):
         rewards = ask(reward, 4, log_metric=logged.__setitem__)
     assert rewards[:3] == [0, 2, None]
@@ -178,16 +181,16 @@ def test_a_batch_without_any_score():
 
 
 def test_a_score_that_nobody_checks_is_believed_as_little_as_an_unrated_step():
-    reward = UncertaintyDiscountedReward(panel([0, 2, 4], [0, 2, None]), scales=AS_THEY_ARE[:2])
+    reward = by_the_old_rule(panel([0, 2, 4], [0, 2, None]), scales=AS_THEY_ARE[:2])
     # 0.1 is the mitigation's weight of what is unrated; what a completion is worth at least is 1 on average.
     assert ask(reward, 3) == pytest.approx([0, 2, 1 + 0.1 * (4 - 1)])
 
 
 def test_a_judge_that_never_varies_is_no_rating():
-    reward = UncertaintyDiscountedReward(panel([0, 2], [0, 2], [7, 7]))
+    reward = by_the_old_rule(panel([0, 2], [0, 2], [7, 7]))
     assert ask(reward, 2) == pytest.approx([-1, 1])
     assert np.isnan(reward.last.ratings[:, 2]).all()
-    assert ask(UncertaintyDiscountedReward(panel([1, 1], [7, 7])), 2) == [0, 0]
+    assert ask(by_the_old_rule(panel([1, 1], [7, 7])), 2) == [0, 0]
 
 
 # What the logs hold
@@ -195,7 +198,7 @@ def test_a_judge_that_never_varies_is_no_rating():
 
 def test_logs_of_completions_and_of_batches():
     columns, means = {}, {}
-    reward = UncertaintyDiscountedReward(panel([0, 2], [0, 2], [0, None]), scales=AS_THEY_ARE, name="mine")
+    reward = by_the_old_rule(panel([0, 2], [0, 2], [0, None]), scales=AS_THEY_ARE, name="mine")
     ask(reward, 2, log_extra=columns.__setitem__, log_metric=means.__setitem__)
     assert reward.__name__ == "mine"
     assert columns["mine/judge 2"] == [0, None]
@@ -238,7 +241,7 @@ def test_async_judges_run_together_on_one_loop():
         await asyncio.to_thread(meeting.wait, 30)  # passes only if both are here at the same time
         return [1.0 * len(text) for text in completions]
 
-    reward = UncertaintyDiscountedReward({"one": waits, "two": waits, "three": says([1, 2])})
+    reward = by_the_old_rule({"one": waits, "two": waits, "three": says([1, 2])})
     for _ in range(2):
         assert reward(prompts=["p", "p"], completions=["a", "bb"]) == pytest.approx([-1, 1])
     assert len(set(loops)) == 1
@@ -250,7 +253,7 @@ async def hangs(completions, **kwargs):
 
 def test_a_late_judge_is_missing_named_counted_and_warned_of_once():
     means = {}
-    reward = UncertaintyDiscountedReward({"a": says([1, 3]), "b": says([1, 3]), "slow": hangs}, timeout={"slow": 0.2})
+    reward = by_the_old_rule({"a": says([1, 3]), "b": says([1, 3]), "slow": hangs}, timeout={"slow": 0.2})
     with pytest.warns(LateJudgeWarning, match="judge 'slow' did not answer within 0.2 s: its scores are missing"):
         assert ask(reward, 2, log_metric=means.__setitem__) == pytest.approx([-1, 1])
     assert ask(reward, 2) == pytest.approx([-1, 1])  # warnings are errors
@@ -262,13 +265,13 @@ def test_a_late_judge_is_missing_named_counted_and_warned_of_once():
 
 
 def test_one_limit_is_that_of_every_judge():
-    reward = UncertaintyDiscountedReward(panel([1, 3], [1, 3]), sigma_m=hangs, timeout=1)
+    reward = by_the_old_rule(panel([1, 3], [1, 3]), sigma_m=hangs, timeout=1)
     with pytest.warns(LateJudgeWarning, match="'sigma_m' did not answer within 1 s"):
         assert ask(reward, 2) == pytest.approx([-1, 1])
 
 
 def test_a_late_ensemble_counts_as_none():
-    reward = UncertaintyDiscountedReward(panel([1, 3], [1, 3]), sigma_m=hangs, timeout={"sigma_m": 0.2})
+    reward = by_the_old_rule(panel([1, 3], [1, 3]), sigma_m=hangs, timeout={"sigma_m": 0.2})
     with pytest.warns(LateJudgeWarning, match="'sigma_m' did not answer within 0.2 s: its disagreement counts as 0"):
         assert ask(reward, 2) == pytest.approx([-1, 1])
     assert reward.last.sigma_m.tolist() == [0, 0]
@@ -309,7 +312,7 @@ def test_a_judge_counts_from_the_first_difference_within_a_group_on():
 
 
 def test_without_groups_nobody_is_left_out():
-    reward = UncertaintyDiscountedReward(panel([1, 2], [5, 7]))
+    reward = by_the_old_rule(panel([1, 2], [5, 7]))
     assert ask(reward, 2, ["p", "q"]) == pytest.approx([-1, 1])
 
 
@@ -389,7 +392,7 @@ def panel_of_texts():
 
 
 def test_a_reward_that_knows_nothing_yet_can_be_looked_at():
-    reward = UncertaintyDiscountedReward(panel([1, 3], [1, 3]))
+    reward = by_the_old_rule(panel([1, 3], [1, 3]))
     with reward.paused():
         assert ask(reward, 2) == pytest.approx([-1, 1])
     assert reward.tally.completions == 0
@@ -465,7 +468,7 @@ def test_bad_answers_name_judge_and_place(answer, message):
     "answer", [[True, False], torch.tensor([1, 0]), (np.float32(1), torch.tensor(0.0)), range(1, -1, -1)]
 )
 def test_numbers_of_all_kinds(answer):
-    reward = UncertaintyDiscountedReward({"a": says(answer), "b": says([1, 0])})
+    reward = by_the_old_rule({"a": says(answer), "b": says([1, 0])})
     assert ask(reward, 2) == pytest.approx([1, -1])
 
 
@@ -657,7 +660,7 @@ def test_the_callback_takes_no_other_reward():
 
 
 def test_the_report(tmp_path):
-    text = watched(UncertaintyDiscountedReward(panel([0, 1], [0, None])), tmp_path, batches=2, size=2).report()
+    text = watched(by_the_old_rule(panel([0, 1], [0, None])), tmp_path, batches=2, size=2).report()
     assert text.startswith("4 completions, 0 without any score, 4 that could not be checked; mean weight 0.10")
     assert "judge judge 1: deviation 0, 2 scores missing" in text
 

@@ -109,6 +109,9 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
     assert third["steps_per_second"] is None
 
 
+OLD = "run --mitigation uard-0.1 --set-mitigation"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -126,7 +129,10 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
         ("reproduce grid-dep", "study = 'grid-dep': must be one of *did you mean 'grid-deep'?"),
         ("run --panel mian", "panel = 'mian': must be one of *did you mean 'main'?"),
         ("run --set sise=5", "environment setting = 'sise': must be one of *did you mean 'size'?"),
-        ("run --set-mitigation lamda=5", "mitigation setting = 'lamda': must be one of *did you mean 'lam'?"),
+        (
+            "run --mitigation uard-0.1 --set-mitigation lamda=5",
+            "mitigation setting = 'lamda': must be one of *did you mean 'lam'?",
+        ),
         ("run --set-agent headz=5", "agent setting = 'headz': must be one of *did you mean 'heads'?"),
         ("run --set size", "--set = 'size': must be name=value"),
         ("run --set size=5 --set size=6", "--set = 'size=6': must be left out: size was set to 5 before"),
@@ -141,9 +147,12 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
         ("run --set traps=[[0,0]]", "traps[0] = (0, 0): must be another cell than the start (0, 0)"),
         ("run --set traps=[[5,5]]", "traps[0] = (5, 5): must be another cell than the goal (5, 5)"),
         ("run --set trap_reward=NaN", "trap_reward = nan: must be a finite number"),
-        ("run --set-mitigation lam=-1", "lam = -1.0: must be a finite number >= 0"),
-        ("run --set-mitigation alpha=2", "alpha = 2.0: must be a finite number in [0, 1]"),
-        ("run --set-mitigation standardise=False", "mitigation setting standardise = 'False': must be true or false"),
+        (f"{OLD} lam=-1", "lam = -1.0: must be a finite number >= 0"),
+        (f"{OLD} alpha=2", "alpha = 2.0: must be a finite number in [0, 1]"),
+        (
+            "run --mitigation uard-0.1 --set-mitigation standardise=False",
+            "mitigation setting standardise = 'False': must be true or false",
+        ),
         ("run --set-agent abstention=safe", "agent setting = 'abstention': must be one of abstention.rule"),
         ("run --seeds 0", "seeds = 0: must be a whole number in [1, 100000]"),
         ("run --seeds -3", "seeds = -3: must be"),
@@ -196,7 +205,7 @@ def test_the_same_command_gives_the_same_numbers(printed, tmp_path):
         ("status --seeds 0", "seeds = 0: must be"),
         ("compare none.sqlite file", "store = 'none.sqlite': must be a result store, but there is no such file"),
         ("compare file none.sqlite", "store = 'file': must be a result store"),
-        ("ledger J99", "claim = 'J99': must be one of F2, "),
+        ("ledger J99", "claim = 'J99': must be one of A30, F2, "),
         ("ledger --seeds 1", "seeds = 1: must be"),
     ],
 )
