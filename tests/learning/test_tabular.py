@@ -160,7 +160,7 @@ def mixed() -> list[Run]:
     """Runs that differ in all that is a number, as one program takes them."""
     return [
         on_grid(seed=1),
-        on_grid(grid=paper_grid(8), seed=2, lam=0.7, noise=0.5),
+        on_grid(grid=paper_grid(8), seed=2, slack=0.2, noise=0.5),
         on_grid(agent=QLearning(gamma=0.9, epsilon=0.5, epsilon_decay=0.9), seed=3, panel="appendix", rated=0.2),
     ]
 
@@ -215,7 +215,7 @@ def test_numbers_do_not_recompile():
     before = runs.one_by_one._cache_size()
     grid = TrapGrid(size=5, traps=((1, 1), (2, 3)), trap_reward=6.5, goal=(0, 4), horizon=33)
     for run in (
-        on_grid(lam=1.5, alpha=0.2, beta=0.9, kappa=3.0, unrated_weight=0.5, prior_count=0.0),
+        on_grid(lies=0.1, slack=0.2, contest=1.5, caution=1.0, risk=0.5, unrated_weight=0.5),
         on_grid(agent=QLearning(epsilon=0.3, epsilon_decay=0.9, epsilon_min=0.01, learning_rate=0.2, gamma=0.9)),
         on_grid(agent=QLearning(bootstrap=0.5, init_scale=0.3)),
         on_grid(noise=1.2, panel="appendix", rated=0.01, seed=77),
@@ -229,10 +229,10 @@ def test_numbers_do_not_recompile():
 def test_whole_numbers_are_numbers_too():
     train(on_grid())
     before = runs.one_by_one._cache_size()
-    same(train(on_grid(lam=1, kappa=2))[0], train(on_grid(lam=1.0, kappa=2.0))[0])
+    same(train(on_grid(contest=1, caution=2))[0], train(on_grid(contest=1.0, caution=2.0))[0])
     train(on_grid(agent=QLearning(epsilon=1, bootstrap=1, gamma=0)))
     assert runs.one_by_one._cache_size() == before
-    assert runs.signature(on_grid(lam=1)) == runs.signature(on_grid(lam=0.5)), "they fit into one batch"
+    assert runs.signature(on_grid(risk=1)) == runs.signature(on_grid(risk=0.5)), "they fit into one batch"
 
 
 @pytest.mark.parametrize("name", ["uard", "mean-of-annotations"])

@@ -20,6 +20,9 @@ from uard.ratings.stream import RewardStream
 
 from . import strategies as some
 
+OLD = named("uard-0.1")  # whose sigma_h is the deviation of the ratings
+
+
 NAN = math.nan
 WIDE = 1000
 
@@ -115,7 +118,7 @@ def test_what_is_learned_of_a_row_depends_on_it_and_on_the_statistics_only(steps
 @given(rated(), rated(), st.booleans())
 def test_sigma_h_of_a_streams_row_is_its_own(steps, others, keyed):
     """Whatever was filtered before it, wide panels included; its weight depends on them by the statistics only."""
-    fresh, used = RewardStream(), RewardStream()
+    fresh, used = RewardStream(OLD), RewardStream(OLD)
     keys = [f"other {k}" for k in others.key] if keyed else None
     used(others.reward, wider(others.ratings), keys=keys)
     used([9.0], np.full((1, WIDE), 2.0), keys=["crowd"] if keyed else None)
@@ -167,7 +170,7 @@ def test_a_rater_who_never_answers_changes_nothing(steps, data):
             assert not mine[:, place].any()
             np.testing.assert_array_equal(np.delete(mine, place, axis=1), theirs)
     for keys in (None, steps.key.tolist()):
-        one, other = (RewardStream()(s.reward, s.ratings, keys=keys) for s in (more, steps))
+        one, other = (RewardStream(OLD)(s.reward, s.ratings, keys=keys) for s in (more, steps))
         for got, want in zip(one, other, strict=True):
             np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-9)
 
@@ -199,7 +202,7 @@ def test_in_chunks_or_one_by_one_the_same_is_known(steps, cuts):
 @pytest.mark.parametrize("raters", [0, 3, 9, 30, WIDE])
 @pytest.mark.parametrize("keyed", [True, False])
 def test_three_who_say_0_of_a_4_disagree_by_the_root_of_3_whoever_rated_before(raters, keyed):
-    stream = RewardStream()
+    stream = RewardStream(OLD)
     if raters:
         stream([1.0], np.ones((1, raters)), keys=["first"] if keyed else None)
     out = stream([4.0], np.zeros((1, 3)), keys=["second"] if keyed else None)
@@ -209,7 +212,7 @@ def test_three_who_say_0_of_a_4_disagree_by_the_root_of_3_whoever_rated_before(r
 @pytest.mark.parametrize("raters", [0, 3, 30, WIDE])
 def test_one_row_of_a_thousand_raters_makes_no_lie_more_believable(raters):
     """After 200 honest steps; the weight was 0.00047, and 18 times as much after one row of 1000 raters."""
-    stream = RewardStream()
+    stream = RewardStream(OLD)
     for _ in range(200):
         stream([-0.1], np.full((1, 3), -0.1))
     if raters:
@@ -227,11 +230,11 @@ def test_one_row_of_a_thousand_raters_makes_no_lie_more_believable(raters):
 
 @pytest.mark.parametrize("panel", [[-1.0], [-1.0, NAN, NAN], [NAN] * 49 + [-1.0]], ids=len)
 def test_one_of_several_who_rated_is_one_rater(panel):
-    assert RewardStream()([4.0], [panel]).sigma_h == pytest.approx([2.5], abs=1e-12)
+    assert RewardStream(OLD)([4.0], [panel]).sigma_h == pytest.approx([2.5], abs=1e-12)
 
 
 def test_a_row_that_fifty_did_not_rate_leaves_the_next_alone():
-    stream = RewardStream()
+    stream = RewardStream(OLD)
     stream([1.0], np.full((1, 50), NAN))
     stream([1.0, 1.0], [[1.0] + [NAN] * 49] * 2)
     assert stream([4.0], [[0.0] * 3]).sigma_h == pytest.approx([math.sqrt(3)], abs=1e-12)
