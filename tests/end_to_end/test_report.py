@@ -16,6 +16,7 @@ pytestmark = pytest.mark.slow
 
 UARD = Path(sys.executable).parent / "uard"
 CLAIMS = [*(f"F{i}" for i in range(2, 6)), *(f"I{i}" for i in range(1, 4)), *(f"J{i}" for i in range(1, 46))]
+CLAIMS += ["A30", "L975", "L1945", "L1985"]  # by their lines in the paper
 NOT_A_NUMBER = re.compile(r"\b(nan|inf)\b", re.IGNORECASE)
 
 
@@ -90,7 +91,11 @@ def test_what_a_reader_sees_first(page):
     assert [r.split("\t")[0] for r in rows] == [
         "baseline",
         "random walk",
-        *(f"{a}, {p} panel" for a in ("uard-paper", "uard-consistent", "uard") for p in ("main", "appendix")),
+        *(
+            f"{a}, {p} panel"
+            for a in ("uard-paper", "uard-consistent", "uard-0.1", "uard")
+            for p in ("main", "appendix")
+        ),
     ]
     assert "2 seeds per cell" in page.locator(".meta").first.inner_text()
 
