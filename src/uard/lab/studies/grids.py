@@ -8,7 +8,7 @@ from uard.agents.tabular import QLearning
 from uard.envs.grids.learned_reward import LearnedRewardGrid
 from uard.envs.grids.trapgrid import TrapGrid, paper_grid
 from uard.lab.cell import Cell
-from uard.lab.studies.common import PANELS, RAW, SIZES, WALKER
+from uard.lab.studies.common import PANELS, RAW, SIMPLE, SIZES, WALKER
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import Mitigation, named
 from uard.ratings.panels import Panel, Rater, as_panel
@@ -16,13 +16,7 @@ from uard.ratings.panels import Panel, Rater, as_panel
 COMPARED = (
     "raw",
     "true-reward",
-    "mean-of-annotations",
-    "median",
-    "worst-of-annotations",
-    "lcb",
-    "min-proxy-mean",
-    "min-proxy-median",
-    "excess",
+    *SIMPLE,
     "screening",
     "uard-paper",
     "uard-consistent",

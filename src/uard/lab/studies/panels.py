@@ -14,26 +14,14 @@ from typing import NamedTuple
 from uard.envs.base import TableEnvironment
 from uard.envs.grids.random_tasks import RandomMDP, random_grid
 from uard.lab.cell import Cell
-from uard.lab.studies.common import RAW, WALKER
+from uard.lab.studies.common import RAW, SIMPLE, WALKER
 from uard.lab.study import LazyRows, Row, Study, row
-from uard.method.mitigations import NAMED, Mitigation, named
+from uard.method.mitigations import Mitigation, named
 from uard.ratings.panels import Panel, random_panel, random_share
 
 OURS, ONE_VETO = "uard", "uard, 1 veto"
 ORACLE, FLOOR = "true-reward", "random walk"  # between which regret is measured
-RIVALS = (
-    "raw",
-    "mean-of-annotations",
-    "median",
-    "worst-of-annotations",
-    "lcb",
-    "min-proxy-mean",
-    "min-proxy-median",
-    "excess",
-    *(name for name in ("witness",) if name in NAMED),
-    "uard-0.1",
-    "uard-paper",
-)
+RIVALS = ("raw", *SIMPLE, "witness", "uard-0.1", "uard-paper")
 GRIDS, MDPS = "random grids", "random MDPs"
 SCALE = 0.3
 """Of a panel that rates a random MDP. Biases, noise and ranges of ``random_panel`` are in units of a grid whose goal

@@ -34,8 +34,6 @@ from uard.ratings.panels import KINDS, Panel, composition, kind_of
 PerSeed = Callable[[Row, str], np.ndarray]  # a metric of a row, one number per seed
 
 LEAST_SPREAD = 1.0  # reward units; of the development scenarios the smallest spread is 10.9 on grids, 16.4 on MDPs
-LEVEL = 0.05  # of tests
-FLIPS = 9999  # of signs
 WORST = 5  # scenarios of ours that are described
 
 
@@ -131,21 +129,10 @@ class Rival:
 def rivals(found: Regrets) -> list[Rival]:
     """Compare every other mitigation with ours, scenario by scenario; the best come first."""
     gaps = {name: values - found.regret[OURS] for name, values in found.regret.items() if name != OURS}
-    p = [paired_p(gap) for gap in gaps.values()]
+    p = [statistics.paired_sign_flip_p(gap) for gap in gaps.values()]
     compared = zip(gaps.items(), p, statistics.holm(p), strict=True)
     made = [Rival(name, statistics.summarise(gap), p, corrected) for (name, gap), p, corrected in compared]
     return sorted(made, key=lambda r: r.gap.mean)
-
-
-def paired_p(gaps: np.ndarray) -> float:
-    """Return the two-sided p value of a sign-flip test of mean 0, of ``FLIPS`` flips.
-
-    Examples:
-        >>> paired_p(np.array([1.0, -1.0])), paired_p(np.ones(20))
-        (1.0, 0.0001)
-    """
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (FLIPS, len(gaps)))
-    return float((1 + (np.abs(signs @ gaps) >= abs(gaps.sum()) - 1e-12).sum()) / (FLIPS + 1))
 
 
 def losses(found: Regrets) -> list[str]:
@@ -180,7 +167,7 @@ def main_table(found: Regrets) -> Table:
         hacks = number(float(found.metrics["hacks"][name].mean())) if "hacks" in found.metrics else ""
         mean = _interval(statistics.summarise(values))
         rows.append((name, mean, f"{number(values[worst])} (seed {found.scenarios[worst]})", *gap, hacks))
-    told = sum(r.p < LEVEL for r in against.values())
+    told = sum(r.p < statistics.LEVEL for r in against.values())
     out = f" {len(found.left_out)} more are left out (oracle less than {LEAST_SPREAD:g} above the random walk)."
     return Table(
         f"Regret on {found.tasks}, {len(found.scenarios)} scenarios",
@@ -189,7 +176,8 @@ def main_table(found: Regrets) -> Table:
         1,
         f"0: as good as learning from the true reward; 1: a random walk. Intervals over scenarios; p of paired "
         f"sign-flip tests, corrected for {len(against)} rivals. Uncorrected, {told} of {len(against)} differ at "
-        f"p < {LEVEL:g}; about {LEVEL * len(against):.1f} would by chance.{out * bool(found.left_out)}",
+        f"p < {statistics.LEVEL:g}; about {statistics.LEVEL * len(against):.1f} would by chance."
+        f"{out * bool(found.left_out)}",
     )
 
 

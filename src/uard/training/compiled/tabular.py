@@ -152,7 +152,6 @@ def train_one(run: Run, program: Program) -> TrainedTables:
     starts = jnp.atleast_1d(jnp.asarray(task.start, jnp.int32))
     raters = run.law.centre.shape[-1]
     asks_raters = mitigation.reads_feedback
-    doubles = mitigation.refits_early and asks_raters
     # One row per state-action, so that a step reads each table once.
     ones = jnp.ones_like(task.reward)
     columns = [run.truth.hack, run.truth.reward, task.reward, run.truth.goal, ones, 0.0 * ones]
@@ -298,7 +297,7 @@ def train_one(run: Run, program: Program) -> TrainedTables:
     )
     kept = jnp.zeros((program.snapshots, *q.shape)), jnp.zeros((program.snapshots, *rows.shape))
     loop = start, jnp.uint32(1), *kept
-    if doubles:
+    if mitigation.refits_early and asks_raters:
         loop = chunk(loop, refits=True)
     c, _, q_kept, rows_kept = lax.while_loop(lambda loop: loop[0].episode < program.episodes, chunk, loop)
     log = c.log[:-1]  # what came after the last episode was put into the last row
