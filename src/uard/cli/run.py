@@ -37,7 +37,7 @@ class Run:
     mitigation: str = "uard"
     """What the agent does about a reward that may lie."""
     set_mitigation: Pairs = ()
-    """Change a field of the mitigation, e.g. lam=5 or kappa=0. Repeatable."""
+    """Change a field of the mitigation, e.g. vetoes=1, or lam=5 of uard-0.1. Repeatable."""
     panel: str = "main"
     """Who rates: a name, random:SEED, or random:SEED:SCALE for rewards of another size than a grid's."""
     noise: float = 0.0

@@ -53,9 +53,10 @@ def smaller_penalties(case: Case, outcome: FilterOutcome) -> Finding | None:
         f"{outcome.name} makes {int(lost.sum())} of {int((case.rated & (r < 0)).sum())} rated penalties smaller than both reward and "
         f"mean rating; most of all in {case.place(worst)}: {r[worst]:.3g} becomes {learned[worst]:.3g}. In {percent(share)} of their "
         "pairs with a step that has a higher reward and a higher mean rating, the penalty is paid more.",
-        "w < 1 draws a negative reward up to an anchor of zero: the agent is let off exactly where people disagree about how "
-        "bad the step was, and enters a hazard that it would avoid without a filter.",
-        "Draw rewards towards the lowest rating, anchor='lowest', not towards zero.",
+        "w < 1 draws a negative reward up to an anchor above it, which is zero as printed: the agent is let off exactly "
+        "where people disagree about how bad the step was, and enters a hazard that it would avoid without a filter.",
+        "Draw rewards towards the lowest rating, anchor='lowest', not towards zero (uard-0.1 does). uard has no such anchor: "
+        "look whether raters copy each other, for it takes their agreement for knowledge.",
         {"penalties": float(lost.sum()), "largest_gain": float(gain[worst]), "turned": share},
     )
 
@@ -128,7 +129,7 @@ def saturated(case: Case, outcome: FilterOutcome) -> Finding | None:
             f"{weights}: nothing is believed.",
             "The agent learns from the anchor alone; honest steps are discounted like lies, and with an anchor of zero "
             "there is nothing left to learn.",
-            "Measure sigmas in units of the reward (standardise=True), or lower lam.",
+            "Measure sigmas in units of the reward (standardise=True), or lower lam; of uard, which has neither, lower lies.",
             numbers,
         )
     if low > 0.9 and disagreement > 0.5:
@@ -137,8 +138,9 @@ def saturated(case: Case, outcome: FilterOutcome) -> Finding | None:
             "warning",
             f"{weights}: everything is believed, though raters disagree by up to {disagreement:.2g} units (95 % of rows).",
             "The filter does nothing: it costs ratings and protects no more than the raw reward.",
-            "Measure sigmas in units of the reward (standardise=True), or raise lam. If raters disagree about all rows "
-            "alike, no filter can tell the rows apart: give the raters clearer instructions.",
+            "Measure sigmas in units of the reward (standardise=True), or raise lam. uard has neither: it takes what "
+            "raters differ by for their noise, which is right if they are noisy. If raters disagree about all rows alike, "
+            "no filter can tell the rows apart: give the raters clearer instructions.",
             numbers,
         )
     return None

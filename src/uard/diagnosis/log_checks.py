@@ -68,7 +68,7 @@ def few_ratings(case: Case) -> Finding | None:
         "few-ratings",
         "warning",
         f"{rated} of {len(case.reward)} rows are rated ({percent(share)}).",
-        "A reward that nobody has rated is believed in part (uard: a tenth) or wholly (the filter as printed), however high "
+        "A reward that nobody has rated is believed in part (uard: a twentieth) or wholly (the filter as printed), however high "
         f"it is; and with fewer than {FEW} rated rows the numbers here mean little.",
         "Rate more, the highest rewards first; with few ratings of one noisy rater named('lcb') does better than uard.",
         {"rated_rows": float(rated), "rated_share": share},

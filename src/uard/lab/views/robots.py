@@ -146,7 +146,7 @@ def headline(p: Published) -> str:
         simple = [r for name in SIMPLE if (r := s.one(name)) is not None]
         what = "; ".join(f"{r['mitigation']} {_true(p, r)}" for r in simple)
         if s.region == "none":
-            out.append(f"{s.name}: true return {_true(p, ours)}, raw {_true(p, raw)}; {what}.")
+            out.append(f"{s.name}: true return {_true(p, ours)} with `uard`, {_true(p, raw)} of raw; {what}.")
         elif honest is not None:
             hacks = [number(p.of(r, "hacks").mean) for r in (raw, ours, honest)]
             true = [_true(p, r) for r in (raw, ours, honest)]
