@@ -35,13 +35,14 @@ $(VENV)/.lab: requirements/lab.txt pyproject.toml | $(VENV)/bin/python
 
 # torch first and pinned: a CPU build, where one is at hand, must not be replaced by a newer CUDA build.
 $(VENV)/.test: $(VENV)/.lab requirements/test.txt requirements/torch.txt requirements/sb3.txt requirements/trl.txt \
-		requirements/ray.txt
+		requirements/ray.txt requirements/verifiers.txt
 	@echo "Installing what the tests need ..."
 	$(PIP) install -r requirements/torch.txt
 	$(PIP) install -r requirements/test.txt
 	$(PIP) install --no-deps -r requirements/sb3.txt
 	$(PIP) install --no-deps -r requirements/trl.txt
 	$(PIP) install --no-deps -r requirements/ray.txt
+	$(PIP) install --no-deps -r requirements/verifiers.txt
 	@touch $@
 
 lock: $(VENV)/bin/python

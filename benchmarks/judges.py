@@ -31,8 +31,8 @@ def load_example():
 def ways(judges):
     """What the trainer is given in each way: a function that makes the reward functions, and settings."""
 
-    def one(mitigation=None):
-        return lambda: [UncertaintyDiscountedReward(judges, mitigation=mitigation)]
+    def one(mitigation=None, **settings):
+        return lambda: [UncertaintyDiscountedReward(judges, mitigation=mitigation, **settings)]
 
     return {
         "added up (TRL's default)": (lambda: list(judges), {}),
@@ -43,7 +43,9 @@ def ways(judges):
         "mean on one scale": (one(named("raw")), {}),
         "lowest judge on one scale": (one(named("worst-of-annotations")), {}),
         "mean - deviation on one scale": (one(named("lcb")), {}),
-        "uard": (one(), {}),
+        "median judge on one scale": (one(named("median")), {}),
+        "uard": (one(proxy="mean"), {}),
+        "uard, median as proxy": (one(proxy="median"), {}),
         "uard, scale_rewards='batch'": (one(), {"scale_rewards": "batch"}),
         "uard, scale_rewards='none'": (one(), {"scale_rewards": "none"}),
     }

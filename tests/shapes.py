@@ -55,7 +55,7 @@ class _Loader(importlib.machinery.SourceFileLoader):
 def checked(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the function, checked after each call that returns; itself if its signature says nothing of shapes."""
     hints = _hints(function.__annotations__, function.__globals__)
-    if not hints:
+    if not hints or inspect.iscoroutinefunction(function):
         return function
     parameters = function.__code__.co_varnames[: function.__code__.co_argcount]
     known: set[Any] = set()  # what has been found right need not be checked again

@@ -26,6 +26,7 @@ from uard import InvalidValueError, UnknownNameError
 from uard.adapters.trl import (
     AbsurdScoreWarning,
     DiscountCancelledWarning,
+    FailedJudgeWarning,
     ForgottenWarning,
     JudgeError,
     LateJudgeWarning,
@@ -38,6 +39,8 @@ from uard.adapters.trl import (
     groups_of,
     keeps_factor,
 )
+from uard.judges import FittedJudge, Judge, JudgePanel, ScoreLog, fit
+from uard.judges.doubts import whys
 from uard.method.mitigations import named, uard_0_1
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "grpo_three_judges.py"
@@ -83,6 +86,109 @@ def ask(reward, size, prompts=None, **kwargs):
 
 
 AS_THEY_ARE = [(0.0, 1.0)] * 3
+
+
+# A panel that was fitted
+
+
+def scores_of_three(size, seed=0):
+    quality = np.random.default_rng(seed).normal(size=(size, 1))
+    return quality + 0.4 * np.random.default_rng(seed + 1).normal(size=(size, 3))
+
+
+FITTED = fit(ScoreLog(("a", "b", "c"), scores_of_three(300))).panel
+
+
+def with_a_panel(scores, **changes):
+    """A reward of judges that know what they say of each completion."""
+    judges = {
+        name: lambda completions, k=k, **_: [scores[int(text), k] for text in completions]
+        for k, name in enumerate(("a", "b", "c"))
+    }
+    return UncertaintyDiscountedReward(judges, panel=FITTED, **changes)
+
+
+def test_with_a_panel_no_batch_matters(tmp_path):
+    scores = scores_of_three(64, seed=5)
+    scores[::7, 2] += 4.0
+    expected = FITTED.combine(scores).reward
+    reward = with_a_panel(scores)
+    texts = [str(i) for i in range(64)]
+    assert reward(["p"] * 64, texts) == pytest.approx(expected, abs=0)
+    with reward.paused():
+        reward(["p"] * 64, texts[::-1])
+    parts = [reward(["p"], [text])[0] for text in texts]
+    assert parts == pytest.approx(expected, abs=0)
+    FITTED.save(tmp_path / "panel.json")
+    judges = {name: reward.judges[name] for name in ("c", "a", "b")}  # the file knows their names
+    other = UncertaintyDiscountedReward(judges, panel=tmp_path / "panel.json")
+    assert other(["p"] * 64, texts) == pytest.approx(expected)
+    assert other.last.weight[7] < 0.5 < other.last.weight[8]
+
+
+def test_with_a_panel_why_is_logged():
+    columns, means = {}, {}
+    reward = with_a_panel(scores_of_three(32))
+    reward(["p"] * 32, [str(i) for i in range(32)], log_extra=columns.__setitem__, log_metric=means.__setitem__)
+    assert columns["uard/why"][0].startswith(("agreed (", "contested ("))
+    assert 1 <= means["uard/judges_at_least"] <= 3
+    assert means["uard/a/failed"] == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"weights": [1, 1, 1]}, "weights = .*: must be left out where a panel is given"),
+        ({"proxy": "a"}, "proxy = 'a': must be left out where a panel is given"),
+        ({"mitigation": named("raw")}, "mitigation = Raw"),
+        ({"clip": 3.0}, "clip = 3.0"),
+        ({"rule": "lcb"}, "rule = 'lcb': must be left out"),
+        ({"scales": [None] * 3}, "scales = "),
+        ({"judges": {"a": says([1]), "d": says([1])}}, "fit it again without 'b', 'c' and with 'd'"),
+        ({"panel": "nowhere.json"}, "panel = 'nowhere.json'"),
+    ],
+)
+def test_a_panel_stands_for_itself(changes, message):
+    given = {"judges": {name: says([1]) for name in "abc"}, "panel": FITTED} | changes
+    with pytest.raises(InvalidValueError, match=message):
+        UncertaintyDiscountedReward(given.pop("judges"), **given)
+
+
+def reads(completions, **question):
+    return [float(text) for text in completions]
+
+
+def test_a_judge_that_dies_half_way_loses_nothing():
+    calls = []
+
+    def dies(completions, **question):
+        calls.append(1)
+        if len(calls) > 2:
+            raise ConnectionError("gone")
+        return [float(text) for text in completions]
+
+    reward = UncertaintyDiscountedReward({"dies": dies, "lives": reads, "too": reads})
+    paid = [reward(["p"] * 3, ["1", "2", "3"]) for _ in range(2)]
+    with pytest.warns(FailedJudgeWarning, match="judge 'dies' raised on 3 completions: ConnectionError: gone"):
+        paid.append(reward(["p"] * 3, ["1", "2", "3"]))
+    assert np.isfinite(paid).all()
+    assert (reward.tally.missing["dies"], reward.tally.failed["dies"], reward.tally.unscored) == (3, 1, 0)
+
+
+def test_what_is_late_within_a_batch_is_named():
+    async def hangs(prompt, completion, **question):
+        if completion == "2":
+            await asyncio.sleep(60)
+        return float(completion)
+
+    slow = Judge(hangs, per_sample=True, timeout=0.3)
+    reward = UncertaintyDiscountedReward(
+        {"slow": slow, "quick": lambda completions, **_: [float(x) for x in completions]}
+    )
+    with pytest.warns(LateJudgeWarning, match="judge 'slow' did not answer in time: its scores are missing for 1 of 3"):
+        reward(["p"] * 3, ["1", "2", "3"])
+    assert reward.tally.late["slow"] == 1
+    assert np.isnan(reward.last.scores[:, 0]).tolist() == [False, True, False]
 
 
 # The arithmetic
@@ -211,6 +317,34 @@ def test_logs_of_completions_and_of_batches():
     assert all(isinstance(value, float) for value in means.values())
 
 
+def test_why_is_said_of_many_as_of_one():
+    ratings = np.random.default_rng(0).normal(size=(300, 4)).round(1) * 3
+    ratings[np.random.default_rng(1).random(ratings.shape) < 0.4] = np.nan
+    ratings[0] = 0.0, -0.0, 1e6, 1e6
+    panel = JudgePanel.plain(["a", "b", "c", "per cent %s"], clip=1e6)
+    combined = panel.of_ratings(ratings)
+    assert whys(combined) == [combined.why(row) for row in range(300)]
+    assert {text.split(" (")[0].split(" ")[-1] for text in whys(combined)} == {"agreed", "contested", "it", "with"}
+    assert whys(panel.of_ratings(ratings[:0])) == []
+
+
+def test_means_in_logs_are_those_of_what_is_known():
+    means = {}
+    judges = {"a": says([1.7e308, 1.7e308, None]), "b": says([None] * 3), "c": says([1.0, 2.0, 4.5])}
+    UncertaintyDiscountedReward(judges)(["p"] * 3, ["a", "b", "c"], log_metric=means.__setitem__)
+    assert (means["uard/a/mean"], means["uard/c/mean"]) == (1.7e308, pytest.approx(2.5))
+    assert "uard/b/mean" not in means
+    assert (means["uard/a/missing"], means["uard/b/missing"]) == (pytest.approx(1 / 3), 1)
+
+
+@pytest.mark.parametrize("far", [1e200, 1.7e308, -1.7e308])
+def test_an_absurd_score_of_a_given_scale_is_named(far):
+    reward = UncertaintyDiscountedReward(panel([1, 2, far], [1, 2, None]), scales=[(1e308, 0.1), (0, 1)])
+    with pytest.warns(AbsurdScoreWarning, match="judge 'judge 0'"):
+        ask(reward, 3)
+    assert reward.tally.absurd == {"judge 0": 3, "judge 1": 0}
+
+
 def test_judges_see_what_trl_passes():
     seen = {}
 
@@ -297,6 +431,35 @@ def test_a_judge_that_scores_the_prompt_is_left_out_and_named():
     assert ask(reward, 8, prompts) == ask(alone, 8, prompts)  # said once
     assert reward.deviations["difficulty"] == pytest.approx(5)
     assert reward.last.sigma_h == pytest.approx(alone.last.sigma_h)
+
+
+@pytest.mark.parametrize(
+    ("tells_apart", "counts", "message"),
+    [
+        (False, False, "No advantage depends on it: the panel, which does not change, leaves it out"),
+        (None, True, "counts it, for the log that it was fitted to had no prompts, or too few"),
+        (True, True, "counts it, for the log that it was fitted to has it tell completions apart"),
+    ],
+)
+def test_a_panel_does_with_a_judge_of_prompts_what_it_says(tells_apart, counts, message):
+    known = [FittedJudge("difficulty", tells_apart=tells_apart), FittedJudge("a"), FittedJudge("b")]
+    judges = {"difficulty": scores_of_prompt, "a": says([0, 1, 2, 3] * 2), "b": says([0, 1, 2, 3] * 2)}
+    reward = UncertaintyDiscountedReward(judges, panel=JudgePanel(tuple(known)))
+    for _ in range(7):
+        ask(reward, 8, ["easy"] * 4 + ["hard"] * 4)
+    with pytest.warns(UselessJudgeWarning, match=message) as seen:
+        ask(reward, 8, ["easy"] * 4 + ["hard"] * 4)
+    assert "until it does" not in str(seen[0].message)
+    assert (~np.isnan(reward.last.ratings[:, 0])).all() == counts
+
+
+def test_a_judge_of_texts_is_told_of_messages():
+    judges = {
+        "says": says([1, 2]),
+        "texts": lambda completions, **_: [float(text.upper() == text) for text in completions],
+    }
+    with pytest.warns(FailedJudgeWarning, match=r"completion\[-1\]\['content'\] is the text of the last one"):
+        UncertaintyDiscountedReward(judges)(["p"] * 2, [[{"role": "assistant", "content": text}] for text in "ab"])
 
 
 def test_a_judge_counts_from_the_first_difference_within_a_group_on():
@@ -435,8 +598,18 @@ async def broken_later(completions, **kwargs):
 
 
 @pytest.mark.parametrize("judge", [broken, broken_later])
-def test_a_judge_that_raises_is_named(judge):
+def test_a_judge_that_raises_is_missing_named_and_counted(judge):
     reward = UncertaintyDiscountedReward({"strict": judge, "kind": says([1])})
+    said = "judge 'strict' raised on 1 completions: ZeroDivisionError: no tokens: its scores are missing for 1 of 1"
+    with pytest.warns(FailedJudgeWarning, match=said):
+        ask(reward, 1)
+    assert np.isnan(reward.last.scores[0, 0])
+    ask(reward, 1)  # warned of once
+    assert reward.tally.failed == {"strict": 2, "kind": 0, "sigma_m": 0}
+
+
+def test_if_all_judges_raise_from_the_first_on_it_is_no_outage():
+    reward = UncertaintyDiscountedReward({"strict": broken, "later": broken_later})
     with pytest.raises(
         JudgeError, match="judge 'strict' raised on 1 completions: ZeroDivisionError: no tokens"
     ) as info:
@@ -497,10 +670,12 @@ def nothing(**kwargs):
         ([broken], {}, r"judges = \['broken'\]: must be at least two: one never disagrees with itself"),
         ([broken, broken], {}, r"names of the judges = \['broken', 'broken'\]: must be different names"),
         ([functools.partial(broken), broken], {}, "must be different names"),
-        ({"weight": broken, "b": broken}, {}, "none of raw, sigma_h, sigma_m, weight"),
+        ({"weight": broken, "b": broken}, {}, "must be others than weight"),
         ([broken, 3], {}, "judge 'int' = 3: must be a reward function or a RewardModel"),
+        ({"why": broken, "b": broken}, {}, "why"),
+        ([broken, nothing], {"rule": "best"}, r"rule = 'best'"),
         ([broken, nothing], {"weights": [1]}, r"len\(weights\) = 1: must be 2, one per judge"),
-        ([broken, nothing], {"weights": [1, 0]}, r"weights\[1\] = 0: must be a finite number > 0"),
+        ([broken, nothing], {"weights": [1, 0]}, "weight of judge 'nothing' = 0: must be a finite number > 0"),
         ([broken, nothing], {"scales": [(0, 1)]}, r"len\(scales\) = 1: must be 2"),
         ([broken, nothing], {"scales": [(0, 1), (0, 0)]}, r"scales\[1\]\[1\] = 0"),
         ([broken, nothing], {"scales": [(np.nan, 1), None]}, r"scales\[0\]\[0\] = nan"),
@@ -509,7 +684,7 @@ def nothing(**kwargs):
         ([broken, nothing], {"weights": "ab"}, "weights = 'ab': must be a list of 2, one per judge"),
         ([broken, nothing], {"weights": {1, 2}}, "weights = "),
         ([broken, nothing], {"weights": [1e308, 1e-308]}, "weights = .*none vanishes beside another"),
-        ([broken, nothing], {"weights": [1, "2"]}, r"weights\[1\] = '2'"),
+        ([broken, nothing], {"weights": [1, "2"]}, "weight of judge 'nothing' = '2'"),
         ([broken, nothing], {"scales": [(0, 1), 3]}, r"scales\[1\] = 3: must be \(location, deviation\), or None"),
         ([broken, nothing], {"scales": [(0, 1), (0, None)]}, r"scales\[1\]\[1\] = None"),
         ([broken, nothing], {"scales": 1.0}, "scales = 1.0: must be a list of 2"),
@@ -1057,3 +1232,41 @@ def test_an_evaluation_teaches_the_reward_nothing(trainer_class, config, tmp_pat
     assert modes.count(True) == 3
     assert modes.count(False) >= 5 * 2
     assert reward.tally.completions == 3 * 8
+
+
+def test_whom_evaluation_warns_of_training_warns_of_too():
+    """What is warned of in evaluation is not counted there, so that training must not keep silent about it."""
+    broken = []
+
+    def breaks(completions, **question):
+        if broken:
+            raise OSError("no route")
+        return [float(len(text)) for text in completions]
+
+    reward = UncertaintyDiscountedReward({"breaks": breaks, "b": lambda completions, **_: [1.0, 2.0]})
+    reward(["p", "p"], ["one", "three"])
+    broken.append(True)
+    with reward.paused(), pytest.warns(FailedJudgeWarning):
+        reward(["p", "p"], ["one", "three"])
+    assert reward.tally.failed["breaks"] == 0
+    with pytest.warns(FailedJudgeWarning):
+        reward(["p", "p"], ["one", "three"])
+    assert reward.tally.failed["breaks"] == 1
+
+
+def test_a_failure_that_the_panel_knows_is_missing_in_the_logs():
+    panel = JudgePanel((FittedJudge("a", sentinels=(-1.0,)), FittedJudge("b")))
+    reward = UncertaintyDiscountedReward({"a": lambda **_: [-1.0, 2.0], "b": lambda **_: [1.0, 2.0]}, panel)
+    columns, means = {}, {}
+    reward(["p", "p"], ["x", "y"], log_extra=columns.__setitem__, log_metric=means.__setitem__)
+    assert columns["uard/a"] == [None, 2.0]
+    assert (means["uard/a/missing"], means["uard/a/mean"]) == (0.5, 2.0)
+    assert reward.tally.missing == {"a": 1, "b": 0}
+
+
+def test_running_scales_take_a_rule_by_its_name():
+    judges = {"a": lambda **_: [1.0, 2.0, 4.0], "b": lambda **_: [1.0, 2.0, -9.0]}
+    by_name = UncertaintyDiscountedReward(judges, rule="lowest")
+    by_mitigation = UncertaintyDiscountedReward(judges, mitigation=named("worst-of-annotations"))
+    batch = ["p"] * 3, ["x", "y", "z"]
+    assert by_name(*batch) == by_mitigation(*batch)

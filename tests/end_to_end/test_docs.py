@@ -11,7 +11,7 @@ import pytest
 from uard.lab import studies
 from uard.lab.execution import runner
 from uard.lab.execution.store import Store
-from uard.lab.views import panels, robots
+from uard.lab.views import grpo, panels, robots
 from uard.lab.views.published import packaged
 from uard.lab.views.study_results import StudyResults
 
@@ -64,7 +64,11 @@ ROWS = {
 
 
 def test_what_the_readme_says_of_robots_is_what_was_published() -> None:
-    assert robots.headline(robots.published()) in " ".join((ROOT / "README.md").read_text().split())
+    assert robots.headline(robots.published()) in (ROOT / "README.md").read_text()
+
+
+def test_what_the_guide_says_of_learned_reward_models_is_what_was_published() -> None:
+    assert grpo.headline(grpo.published()) in (ROOT / "docs" / "guides" / "judges.md").read_text()
 
 
 def test_what_the_readme_says_of_random_panels_is_what_was_published() -> None:

@@ -44,6 +44,13 @@ def test_a_csv_of_ratings(tmp_path: Path) -> None:
     assert "DANGER" in run("csv_of_ratings.py", tmp_path)
 
 
+def test_a_task_of_verifiers(tmp_path: Path) -> None:
+    found = re.findall(r"reward ([-+\d.]+), believed to (\d+) %", run("verifiers_task.py", tmp_path))
+    (topic, _), (filler, _), (hack, believed) = found
+    assert float(topic) > float(filler) > float(hack)
+    assert int(believed) < 10
+
+
 @pytest.mark.parametrize("name", sorted(p.name for p in EXAMPLES.glob("*.py")))
 def test_every_example_has_a_test(name: str) -> None:
     assert name in Path(__file__).read_text() or name in "".join(

@@ -27,6 +27,7 @@ from uard.lab.cell import Cell
 from uard.lab.config import FORMAT, key_of, plain, type_name
 from uard.lab.execution import runner
 from uard.lab.execution.store import Store
+from uard.lab.language.setting import Grpo, Language
 from uard.lab.registry import AGENTS, CONTINUOUS, ENVIRONMENTS
 from uard.lab.result import Result
 from uard.lab.trainers import TRAINERS
@@ -376,6 +377,7 @@ def test_no_two_classes_of_ours_that_can_be_in_a_cell_have_one_name():
 def test_a_raised_version_changes_the_keys_of_that_kind_of_training_only(monkeypatch):
     cells = [Cell(), Cell(agent=AGENTS["dqn"]), Cell(agent=AGENTS["ppo"])]
     cells += [Cell(ENVIRONMENTS["Hopper"], agent=CONTINUOUS[name]) for name in ("sac", "ppo")]
+    cells += [Cell(Language(), agent=Grpo())]
     assert [type(c.trainer) for c in cells] == [type(t) for t in TRAINERS], "one of each kind"
     for raised in cells:
         before = [c.key for c in cells]

@@ -174,7 +174,9 @@ def test_a_column_of_text_in_parquet(tmp_path):
     with pytest.raises(InvalidValueError, match="column 'rating_a' = 'string': must be a column of numbers"):
         logs.read(tmp_path / "log.parquet")
     parquet.write_table(pa.table({"score": [1.0], "rating_a": [1]}), tmp_path / "log.parquet")
-    with pytest.raises(InvalidValueError, match="column = 'reward': must be one of rating_a, score"):
+    assert logs.read(tmp_path / "log.parquet").reward is None
+    parquet.write_table(pa.table({"rewards": [1.0], "rating_a": [1]}), tmp_path / "log.parquet")
+    with pytest.raises(InvalidValueError, match="column = 'reward': must be one of rating_a, rewards"):
         logs.read(tmp_path / "log.parquet")
 
 

@@ -370,3 +370,15 @@ def test_order_statistics_are_those_of_a_sort(size, library):
         count = min(3, size - first)
         found = smallest(convert(values), convert(np.full((1, 3), first)), axis=0, count=count)
         np.testing.assert_array_equal(np.asarray(found), ranked[first : first + count])
+
+
+def test_a_tied_lowest_word_is_overruled_in_any_order_alike():
+    random = np.random.default_rng(5)
+    for _ in range(50):
+        said = random.integers(-2, 3, (1, 6)).astype(float)
+        said[0, :2] = -9.0  # two say the same lowest
+        variance, noise = random.uniform(0.01, 1.0, (1, 6)), random.uniform(0.01, 1.0, 6)
+        heard = pooled.overruled(said, np.ones((1, 6), bool), variance, noise, vetoes=1)
+        order = random.permutation(6)
+        again = pooled.overruled(said[:, order], np.ones((1, 6), bool), variance[:, order], noise[order], vetoes=1)
+        assert np.array_equal(heard[:, order], again)

@@ -6,7 +6,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from uard import InvalidValueError, RatingLog, doctor
@@ -285,14 +285,18 @@ def test_effective_number_of_raters():
     random = np.random.default_rng(0)
     truth, mistake = random.normal(size=(2, 20_000))
     shared = RatingLog(truth, (truth + mistake)[:, None] + random.normal(size=(20_000, 4)), true_reward=truth)
-    found = doctor(shared).independence  # errors correlate by 1/2: 4 / (1 + 3/2)
+    told = doctor(shared)
+    found = told.independence  # errors correlate by 1/2: 4 / (1 + 3/2)
     assert found.against == "true_reward"
-    assert found.correlation == pytest.approx(0.5, abs=0.02)
-    assert found.effective == pytest.approx(1.6, abs=0.05)
-    assert doctor(shared).as_data()["independence"]["effective"] == found.effective
-    assert f"4 are worth {found.effective:.3g} independent ones" in str(doctor(shared))
-    blind = RatingLog(truth + mistake, shared.ratings)  # the reward makes the same mistake, and nobody can know
-    assert doctor(blind).independence.effective == pytest.approx(4.0, abs=0.1)
+    assert found.correlation.low < 0.5 < found.correlation.high < found.correlation.low + 0.04
+    assert found.number.value == pytest.approx(1.6, abs=0.05)
+    assert told.as_data()["independence"]["number"]["value"] == found.number.value
+    assert f"4 are worth {found.number:.3g} independent ones" in str(told)
+    assert "shared-errors" in {finding.code for finding in told.findings}
+    blind = doctor(RatingLog(truth + mistake, shared.ratings))  # the reward makes the same mistake, and nobody can know
+    assert blind.independence.number.value == pytest.approx(4.0, abs=0.1)
+    own = RatingLog(truth, truth[:, None] + random.normal(size=(20_000, 4)), true_reward=truth)
+    assert "shared-errors" not in {finding.code for told in (blind, doctor(own)) for finding in told.findings}
     assert doctor(RatingLog(truth, shared.ratings[:, :1])).independence is None
 
 
@@ -329,6 +333,7 @@ def test_any_numbers_end_in_a_diagnosis_that_json_can_hold(log, mitigation):
 
 
 @given(st.integers(0, 10_000), st.sampled_from(["dense", "sparse", "binary"]), st.booleans())
+@example(2237, "dense", False)  # items that differ in no more than the rounding of their sums
 @settings(max_examples=25, deadline=None)
 def test_the_order_of_rows_and_raters_changes_no_number(seed, kind, in_units):
     log = in_three_units(np.random.default_rng(seed)) if in_units else honest(kind, seed)
@@ -340,7 +345,10 @@ def test_the_order_of_rows_and_raters_changes_no_number(seed, kind, in_units):
     )
     a, b = (doctor(x) for x in (RatingLog(log.reward, log.ratings, log.raters, by=by), mixed))
     assert a.agreement_interval == pytest.approx(b.agreement_interval)
-    assert a.independence is b.independence or a.independence.correlation == pytest.approx(b.independence.correlation)
+    if a.independence is not b.independence:  # of rows that hold the same ratings, the interval depends on their order
+        one, other = (x.independence.correlation for x in (a, b))
+        assert one.value == pytest.approx(other.value)
+        assert one == pytest.approx(other, abs=0.1)
     assert [s.agreement for s in a.strata] == pytest.approx([s.agreement for s in b.strata])
     numbers = [
         {f.code: dict(f.numbers) for f in x.findings if f.code in OF_RATERS and f.code != "straight-lining"}

@@ -79,7 +79,7 @@ def write(path: str | Path, text: str, field: str) -> None:
         with replacing(path) as file:
             file.write(text.encode(errors="backslashreplace"))  # half a surrogate pair has no UTF-8
     except OSError as error:
-        raise InvalidValueError(field, str(path), f"a file that can be written ({error})") from None
+        raise InvalidValueError(field, str(path), f"a file that can be written ({error.strerror or error})") from None
 
 
 def prepare(path: str | Path, field: str, *read: str | Path | None) -> None:
@@ -103,7 +103,7 @@ def prepare(path: str | Path, field: str, *read: str | Path | None) -> None:
             return
         found = _status(path)
     except OSError as error:
-        raise InvalidValueError(field, str(path), f"a file that can be written ({error})") from None
+        raise InvalidValueError(field, str(path), f"a file that can be written ({error.strerror or error})") from None
     if found is not None and stat.S_ISDIR(found.st_mode):
         raise InvalidValueError(field, str(path), "a file, not a folder")
     if found is None or stat.S_ISREG(found.st_mode):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC
 from typing import ClassVar, Literal
 
-Family = Literal["tabular", "replay", "rollout", "continuous-replay"]
+Family = Literal["tabular", "replay", "rollout", "continuous-replay", "language"]
 
 
 class Agent(ABC):
@@ -14,7 +14,7 @@ class Agent(ABC):
     Attributes:
         family: Which kind of training loop trains it: one that keeps tables (``tabular``), one that replays transitions
             of discrete actions (``replay``) or of continuous ones (``continuous-replay``), or one that learns from
-            what was just done (``rollout``; actions of both kinds).
+            what was just done (``rollout``; actions of both kinds), or one that trains a language model (``language``).
     """
 
     family: ClassVar[Family]

@@ -22,6 +22,7 @@ OWN = {
     "doctor": "doctor.Doctor",
     "preferences": "preferences.Preferences",
     "raters": "raters.Raters",
+    "judges": "judges.Judges",
     "best-of-n": "best_of_n.BestOfN",
     "leaderboard": "leaderboard.Leaderboard",
     "status": "status.Status",

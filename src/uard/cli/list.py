@@ -11,6 +11,7 @@ from uard.cli import terminal
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from uard.lab.study import Study
     from uard.plugins import PluginError
 
 
@@ -36,10 +37,7 @@ class List:
             "panels": {k: str(v) for k, v in PANELS.items()}
             | {f"{RANDOM}SEED": "one to seven raters drawn at random, the same for the same seed"},
             **{
-                f"studies of {group}": {
-                    s.name: f"{s.title} ({s.answers}; {counted(len(s.rows), 'cell')}{'; to tune on' * s.development})"
-                    for s in members
-                }
+                f"studies of {group}": {s.name: f"{s.title} ({'; '.join(_facts(s))})" for s in members}
                 for group, members in studies.groups().items()
             },
         }
@@ -47,6 +45,12 @@ class List:
             terminal.glossary(title, entries)
         for error in broken():
             terminal.warning(console, str(error))
+
+
+def _facts(study: Study) -> list[str]:
+    """Return what a study answers, if anything of the paper, how large it is, and what it is for."""
+    facts = [study.answers, counted(len(study.rows), "cell"), "to tune on" if study.development else ""]
+    return [fact for fact in facts if fact]
 
 
 def broken() -> list[PluginError]:

@@ -64,7 +64,7 @@ class Reproduce:
         from uard.lab.execution.store import Store
 
         _checks.whole("seeds", self.seeds, low=2, high=100_000)
-        _checks.whole("first_seed", self.first_seed)
+        _checks.whole("first_seed", self.first_seed, high=2**31)
         terminal.check_workers(self.workers)
         engine = self._engine()
         unusable = [str(error) for error in broken()]
@@ -105,6 +105,7 @@ class Reproduce:
             results = StudyResults(store, seeds, chosen)
             for study in chosen:
                 terminal.show(study_table(study, results))
+                self._show_own(study, store)
 
     def _show_published(self, study: Study, console: Console) -> None:
         from uard.lab.views.published import Published, read_file
@@ -126,6 +127,15 @@ class Reproduce:
             return
         written = page.write_page(Path(self.report), [panels.section(study, found, seeds)], seeds)
         terminal.say(console, f"report: {written}")
+
+    def _show_own(self, study: Study, store: Store) -> None:
+        """Print what a study has to show beside its metrics."""
+        from uard.lab.views import grpo, published
+
+        if study.name == grpo.STUDY:
+            found = published.Published([study], [published.extract([study], store, self._seeds, self._said_of_seeds)])
+            for table in grpo.tables(found):
+                terminal.show(table)
 
     @property
     def _seeds(self) -> range:

@@ -16,6 +16,7 @@ from uard.method.weights import discount
 from uard.ratings.aggregate import aggregate, by_item
 from uard.ratings.log import RatingLog
 from uard.ratings.pairs import Shared, sample_of_raters, sample_of_rows, shared
+from uard.ratings.sentinels import others_of
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Integer, Shaped
@@ -112,11 +113,8 @@ class Case:
         """What the checks of raters look at."""
         raters = sample_of_raters(self.ratings.shape[1])
         rows = sample_of_rows(len(self.reward), raters.size)
-        ratings = self.ratings[rows]
-        count, total = np.isfinite(ratings).sum(1)[:, None], np.nansum(ratings, 1)[:, None]
-        ratings = ratings[:, raters]
-        beside = count - np.isfinite(ratings)
-        others = np.where(beside > 0, (total - np.nan_to_num(ratings)) / np.maximum(beside, 1), np.nan)
+        others = others_of(self.ratings[rows])[:, raters]
+        ratings = self.ratings[np.ix_(rows, raters)]
         names = tuple(self.log.raters[int(k)] for k in raters)
         return Sample(rows, raters, names, self.reward[rows], ratings, others)
 

@@ -32,11 +32,12 @@ from uard.diagnosis.self_consistency import self_consistency
 from uard.diagnosis.strata import strata_of
 from uard.method.mitigations import Mitigation
 from uard.ratings import readers
-from uard.ratings.agreement import Independence, alpha_interval, independence, krippendorff_alpha
+from uard.ratings.agreement import alpha_interval, krippendorff_alpha
 from uard.ratings.log import RatingLog
+from uard.ratings.raters import EffectiveRaters, effective_raters
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Shaped
 
 
 def doctor(
@@ -88,6 +89,8 @@ def doctor(
     strata = strata_of(None if log.by is None else log.by[case.rows], case.ratings, of_row)
     found = [log_checks.not_finite(log), *(check(case) for check in (RATER_CHECKS if log.reward is None else CHECKS))]
     found.append(agreement_checks.uneven_agreement(strata, agreement))
+    worth = _independence(case, of_row)
+    found.append(truth_checks.shared_errors(worth))
     return Diagnosis(
         source=log.source,
         mitigation=name if isinstance(mitigation, str) else repr(mitigation),
@@ -97,18 +100,18 @@ def doctor(
         agreement=agreement,
         agreement_interval=alpha_interval(case.ratings, of_row),
         strata=strata,
-        independence=_independence(case),
+        independence=worth,
         calibration=truth_checks.calibration_of(case),
         findings=tuple(sorted((f for f in found if f is not None), key=lambda f: SEVERITIES.index(f.severity))),
     )
 
 
-def _independence(case: Case) -> Independence | None:
+def _independence(case: Case, item: Shaped[np.ndarray, " n"] | None) -> EffectiveRaters | None:
     if case.log.reward is None:
         return None
     if case.true is not None:
-        return independence(case.ratings, case.true, "true_reward")
-    return independence(case.ratings, case.reward, "reward")
+        return effective_raters(case.ratings, case.true, "true_reward", item)
+    return effective_raters(case.ratings, case.reward, "reward", item)
 
 
 def filtered(log: RatingLog, mitigation: str | Mitigation = "uard") -> Float[np.ndarray, " n"]:
@@ -171,6 +174,6 @@ CHECKS: tuple[Callable[[Case], Finding | None], ...] = (
 CODES = (
     "not-finite", "no-ratings", "few-ratings", "missing-ratings", "idle-raters", "sentinel-value", "straight-lining",
     "too-constant", "copied-ratings", "mixed-units", "uneven-agreement", "one-rater", "self-consistency", "no-rewards",
-    "reward-contradicted", "other-units", "colluding-raters", "dead-ensemble", "blind-sigma", "smaller-penalties",
+    "reward-contradicted", "other-units", "colluding-raters", "shared-errors", "dead-ensemble", "blind-sigma", "smaller-penalties",
     "origin-and-unit", "lie-still-pays", "saturated-weights",
 )  # fmt: skip

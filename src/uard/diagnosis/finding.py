@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from uard.ratings.agreement import Independence
+from uard.ratings.raters import EffectiveRaters
 
 Severity = Literal["danger", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("danger", "warning", "note")
@@ -103,7 +103,7 @@ class Diagnosis:
     agreement: float | None
     agreement_interval: tuple[float, float] | None
     strata: tuple[Stratum, ...]
-    independence: Independence | None
+    independence: EffectiveRaters | None
     calibration: Mapping[str, Mapping[str, float]] | None
     findings: tuple[Finding, ...]
 
@@ -115,7 +115,7 @@ class Diagnosis:
         """Return everything as plain data that JSON can hold."""
         data = asdict(self)
         if self.independence is not None:
-            data["independence"]["effective"] = self.independence.effective
+            data["independence"] = self.independence.as_data()
         return data | {name: list(data[name]) for name in ("raters", "strata", "findings")}
 
     def __str__(self) -> str:
@@ -134,8 +134,8 @@ class Diagnosis:
         if (i := self.independence) is not None:
             errors = "their errors" if i.against == "true_reward" else "what the reward misses, error or truth,"
             lines.append(
-                f"raters      a row's {i.raters:.3g} are worth {i.effective:.3g} independent ones (mean correlation of "
-                f"{errors} {i.correlation:.2f})"
+                f"raters      a row's {i.raters:.3g} are worth {i.number:.3g} independent ones (mean correlation of "
+                f"{errors} {i.correlation.value:.2f})"
             )
         for sigma, values in (self.calibration or {}).items():
             shown = ", ".join(f"{name} {value:.3f}" for name, value in values.items())

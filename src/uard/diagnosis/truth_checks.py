@@ -9,6 +9,7 @@ import numpy as np
 from uard.diagnosis.case import Case, mostly
 from uard.diagnosis.finding import Finding, percent, row_count
 from uard.method import calibration, uncertainty
+from uard.ratings.raters import EffectiveRaters
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Integer
@@ -37,6 +38,24 @@ def colluding(case: Case) -> Finding | None:
         "Agreement is taken for truth. No method that relies on these raters can help; the agent learns what they repeat.",
         "No setting avoids it. Ask people who do not see the reward or each other, and check a sample against the truth.",
         {"rows": float(wrong.sum()), "share": share, "largest": float(error[worst]), "overpaid": paid},
+    )
+
+
+def shared_errors(worth: EffectiveRaters | None) -> Finding | None:
+    """Raters err together: they are surely worth less than half their number."""
+    if worth is None or worth.against != "true_reward":
+        return None
+    most = worth.number.high
+    if most is None or most >= worth.raters / 2:
+        return None
+    return Finding(
+        "shared-errors",
+        "warning",
+        f"A row's {worth.raters:.3g} raters are worth {worth.number:.2g} independent ones: their errors correlate, by "
+        f"{worth.correlation:.2f}.",
+        "They agree in what is wrong, so that their agreement says less than their number promises; sigma_h does not see it.",
+        "Ask fewer of the same kind and others of another kind: people beside models, models of other makers.",
+        {"raters": worth.raters, "effective": worth.number.value, "correlation": worth.correlation.value},
     )
 
 

@@ -1,7 +1,7 @@
-"""What the configuration of an environment is: a frozen dataclass of one of three kinds.
+"""What the configuration of an environment is: a frozen dataclass of one of four kinds.
 
-The kind says which agents can be trained in it, and how (``uard.lab.trainers``): tables, a compiled world, or
-a simulator that runs on the host.
+The kind says which agents can be trained in it, and how (``uard.lab.trainers``): tables, a compiled world, a simulator
+that runs on the host, or a language, whose episodes are answers (``uard.lab.language``).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from uard.ratings.panels import Panel, RatingLaw
 if TYPE_CHECKING:
     from uard.envs.world import TableWorld
 
-Kind = Literal["tables", "world", "simulator"]
+Kind = Literal["tables", "world", "simulator", "language"]
 
 
 class Environment(ABC):

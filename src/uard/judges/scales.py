@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 EQUAL = 1e-9  # relative deviation at which numbers count as equal
 FAR = 10.0  # standard deviations from the mean at which a number is cut off before it enters the scale
+FARTHEST = 32  # one in so many numbers may be an accident
 ABSURD = 100.0  # standard deviations from the mean beyond which a number is reported
 FEW = 7  # numbers; the deviation of fewer says too little to call another one absurd
 CHANGED = 3  # calls in a row with most numbers cut off, after which the judge has a new scale
@@ -58,9 +59,10 @@ class Scale:
 
     One absurd number must not silence a judge for the rest of a run, so a number enters as at most 10 standard
     deviations from the mean. While there is no deviation yet, that of the new numbers counts, without the farthest of
-    them (1 in 32, at least one); and the only number so far that differs from all others is looked at again with the
-    next ones. Where most numbers of three calls in a row are cut off, the judge has changed its unit: the scale starts
-    again from the third.
+    them (1 in 32, at least one); where more than these would be cut off, they are no accidents, such as the few ones of
+    a judge that says 0 nearly always, and all count. The only number so far that differs from all others is looked at
+    again with the next ones. Where most numbers of three calls in a row are cut off, the judge has changed its unit:
+    the scale starts again from the third.
 
     Examples:
         >>> scale = Scale()
@@ -104,7 +106,7 @@ class Scale:
         given = np.sort(values if self.lone is None else np.append(values, self.lone), axis=None)
         new, base, self.lone = _held(given), self.known, None
         if base.deviation == 0:
-            base = base.including(_without_the_farthest(new, base.mean if base.number else float(np.median(new))))
+            base = base.including(_ordinary(new, base.mean if base.number else float(np.median(new))))
             odd = abs(new - base.mean) > EQUAL * abs(base.mean)
             if base.deviation == 0 and base.number and odd.sum() == 1:
                 self.known, self.lone = self.known.including(new[~odd]), float(given[odd][0])
@@ -126,9 +128,13 @@ class Scale:
         return self.known if self.lone is None else self.known.including(_held(np.array([self.lone])))
 
 
-def _without_the_farthest(values: Float[np.ndarray, " n"], centre: float) -> Float[np.ndarray, " ordinary"]:
-    nearest = np.argsort(abs(values - centre), kind="stable")
-    return values[nearest[: -max(1, values.size // 32)]]
+def _ordinary(values: Float[np.ndarray, " n"], centre: float) -> Float[np.ndarray, " ordinary"]:
+    """Return numbers without the farthest of them, unless those that are far from the rest are too many for that."""
+    few = max(1, values.size // FARTHEST)
+    nearest = values[np.argsort(abs(values - centre), kind="stable")[:-few]]
+    of_nearest = NONE.including(nearest)
+    far = abs(values - of_nearest.mean) > FAR * of_nearest.deviation
+    return values if of_nearest.deviation > 0 and far.sum() > few else nearest
 
 
 def _held(values: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:

@@ -39,8 +39,8 @@ class Cell:
         environment: Where it learns.
         mitigation: What the agent does about a reward that may lie.
         agent: The learner.
-        panel: Who rates. Irrelevant, and therefore ignored, for a mitigation that reads no ratings; so are ``noise``,
-            ``rated``, ``rating_model`` and ``query``.
+        panel: Who rates. Irrelevant, and therefore ignored, for a mitigation that reads no ratings, and where an
+            environment has judges of its own; so are ``noise``, ``rated``, ``rating_model`` and ``query``.
         noise: Standard deviation of extra noise on every rater, in reward units, >= 0.
         rated: Fraction of steps that are rated, in [0, 1].
         episodes: Training episodes, in 1..1 000 000; ignored on a simulator.
@@ -93,7 +93,7 @@ class Cell:
             raise _checks.InvalidValueError("mitigation", self.mitigation, allowed)
         self._settle_budget(trainer)
         self._settle_feedback(trainer)
-        if not self.mitigation.reads_feedback:
+        if not (self.mitigation.reads_feedback and trainer.has_panel):
             for name, value in _UNASKED.items():
                 self._put(name, value)
 

@@ -116,13 +116,13 @@ def wilson(share: float, n: float) -> Interval:
 
     Args:
         share: Of the n, in [0, 1].
-        n: How many independent trials there were, > 0.
+        n: How many independent trials there were, >= 1.
 
     Raises:
         InvalidValueError: a share outside [0, 1], or no trials.
     """
     _checks.number("share", share, low=0, high=1)
-    _checks.number("n", n, low=0, open_low=True)
+    _checks.number("n", n, low=1)
     z2 = 1.959963984540054**2
     middle, half = share + z2 / (2 * n), math.sqrt(z2 * (share * (1 - share) / n + z2 / (4 * n * n)))
     low, high = (middle - half) / (1 + z2 / n), (middle + half) / (1 + z2 / n)
@@ -317,7 +317,8 @@ def _mean_and_variance(x: np.ndarray) -> tuple[float, float]:
 def paired(a: object, b: object) -> Test:
     """Student's t test of the differences a - b of the same seeds (or tasks).
 
-    ``effect`` is their mean in their standard deviations, corrected for small samples as ``hedges_g`` is.
+    ``effect`` is their mean in their standard deviations, corrected for small samples as ``hedges_g`` is; of two
+    differences it is NaN, and if these are equal they are no evidence.
 
     Examples:
         >>> test = paired([1.0, 2.0, 3.0], [0.0, 0.0, 0.0])
@@ -335,11 +336,12 @@ def paired(a: object, b: object) -> Test:
     df = float(n - 1)
     if sd == 0:
         t = 0.0 if mean == 0 else math.copysign(math.inf, mean)
-        return Test(t, df, 1.0 if t == 0 else 0.0, mean, t)
+        return Test(t, df, 1.0 if t == 0 or n == 2 else 0.0, mean, math.nan if n == 2 else t)
     from scipy.special import stdtr
 
     t = mean / (sd / math.sqrt(n))
-    return Test(t, df, float(2 * stdtr(df, -abs(t))), mean, mean / sd * (1 - 3 / (4 * df - 1)))
+    effect = math.nan if n == 2 else mean / sd * (1 - 3 / (4 * df - 1))
+    return Test(t, df, float(2 * stdtr(df, -abs(t))), mean, effect)
 
 
 def _differences(a: object, b: object) -> tuple[float, float, int]:

@@ -175,8 +175,11 @@ def overruled(
     zero = xp.zeros_like(said)
     count = xp.sum(xp.astype(here, said.dtype), axis=-1)
     for number in range(min(vetoes, max(0, raters - FEWEST + 2) // 2)):
-        lowest = xp.argmin(xp.where(here, said, zero + xp.finfo(said.dtype).max), axis=-1)
-        dissenter = (xp.arange(raters) == lowest[..., None]) & here
+        largest = zero + xp.finfo(said.dtype).max
+        lowest = here & (said == xp.min(xp.where(here, said, largest), axis=-1)[..., None])
+        # Of several who say the same, the least precise one, so that the order of raters does not matter.
+        loosest = xp.argmax(xp.where(lowest, variance, -largest), axis=-1)
+        dissenter = (xp.arange(raters) == loosest[..., None]) & here
         others = here & ~dissenter
         tau2 = variance_between(said, others, variance)
         distance = precise_mean(said, others, variance)[..., None] - said

@@ -71,7 +71,7 @@ def alpha_interval(ratings: object, item: object = None, seed: int = 0) -> tuple
         return None
     items = len(parts)
     if items <= MOST_RESAMPLED:
-        parts = parts[np.lexsort(parts.T)]
+        parts = parts[np.lexsort(parts.round(9).T)]  # what differs by rounding alone depends on the order of raters
         drawn = np.random.default_rng(seed).multinomial(items, np.full(items, 1.0 / items), size=RESAMPLES)
         alphas = _alpha(drawn @ parts)
         low, high = np.quantile(alphas[np.isfinite(alphas)], [0.025, 0.975])

@@ -167,8 +167,9 @@ def orders(
     for rule, values, whole in _values(answers):
         alike = _alike(values, difference, first, second)
         value, error = jackknife(alike.shares, unit)
-        with_own = _alike(whole, difference, first, second).shares(np.arange(len(unit)))
-        for n, v, e, w, pairs in zip(names, value, error, with_own, (told.sum(), *told.sum(0)), strict=True):
+        whole = _alike(whole, difference, first, second)
+        with_own, compared = whole.shares(np.arange(len(unit))), np.where(np.isfinite(value), alike.pairs, whole.pairs)
+        for n, v, e, w, pairs in zip(names, value, error, with_own, compared, strict=True):
             share = _within(interval(float(v), float(e), np.unique(unit).size))
             rows[n].append(OrderAgreement(rule, n, int(pairs), share, float(w) if np.isfinite(w) else None))
     some = np.unique(unit[first[told.any(1)]]).size
@@ -262,6 +263,11 @@ class _Alike:
     first: Integer[np.ndarray, " p"]
     second: Integer[np.ndarray, " p"]
     items: int
+
+    @property
+    def pairs(self) -> Float[np.ndarray, " many"]:
+        """How many pairs are compared, of all raters and of each."""
+        return np.append(self.told.sum(), self.told.sum(0))
 
     def shares(self, rows: Integer[np.ndarray, " m"]) -> Float[np.ndarray, " many"]:
         """Return the shares among pairs of these items; NaN where there are none."""

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 A_PANEL = "a tuple of one Rater or more"
 OUTLIER = 6.0  # times the usual noise
+MOST = 1e30  # of a rater's numbers: single precision holds what is made of them
 UNIFORMS = 3  # uniform numbers that an answer needs of a rater who lapses, skips steps or counts in stars
 
 
@@ -77,21 +78,21 @@ class Rater:
             InvalidValueError: naming the field, the value and what is allowed.
         """
         _checks.number("temptation", self.temptation, low=0, high=1)
-        _checks.number("bias", self.bias)
-        _checks.number("scale", self.scale)
+        _checks.number("bias", self.bias, low=-MOST, high=MOST)
+        _checks.number("scale", self.scale, low=-MOST, high=MOST)
         if self.scale == 0:
             raise _checks.InvalidValueError("scale", self.scale, "another number than 0")
-        _checks.number("noise", self.noise, low=0)
+        _checks.number("noise", self.noise, low=0, high=MOST)
         if self.contested_noise is not None:
-            _checks.number("contested_noise", self.contested_noise, low=0)
+            _checks.number("contested_noise", self.contested_noise, low=0, high=MOST)
         _checks.number("lapse", self.lapse, low=0, high=1)
         _checks.number("coverage", self.coverage, low=0, high=1, open_low=True)
         if self.stars is not None:
             _checks.whole("stars", self.stars, low=2, high=1000)
         _checks.number("outliers", self.outliers, low=0, high=1)
         if self.veto_above is not None:
-            _checks.number("veto_above", self.veto_above)
-        _checks.number("veto", self.veto)
+            _checks.number("veto_above", self.veto_above, low=-MOST, high=MOST)
+        _checks.number("veto", self.veto, low=-MOST, high=MOST)
         if self.veto and self.veto_above is None:
             raise _checks.InvalidValueError("veto", self.veto, "left out where veto_above is")
 
@@ -203,7 +204,7 @@ class Panel:
             raise _checks.InvalidValueError("low", self.low, allowed)
         for name in ("low", "high"):
             if getattr(self, name) is not None:
-                _checks.number(name, getattr(self, name))
+                _checks.number(name, getattr(self, name), low=-MOST, high=MOST)
         if self.low is not None and self.high is not None:
             _checks.number("high", self.high, low=self.low, open_low=True)
 
@@ -338,7 +339,7 @@ def random_panel(seed: int, scale: float = 1.0) -> Panel:
         InvalidValueError: for a seed or a scale out of range.
     """
     _checks.whole("seed", seed, low=0)
-    _checks.number("scale", scale, low=0, open_low=True)
+    _checks.number("scale", scale, low=0, high=MOST, open_low=True)
     random = np.random.default_rng([seed, 1])
     raters = int(random.integers(1, 8))
     stars = 7 if random.random() < 0.25 else None

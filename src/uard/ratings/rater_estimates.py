@@ -16,13 +16,11 @@ import numpy as np
 
 from uard.method.feedback import ByRater
 from uard.method.rater_statistics import (
-    DRAWN,
     RaterStatistics,
     fit,
     leave_one_out_medians,
     masked_median,
     own_variance,
-    robust_bias,
 )
 from uard.ratings.log import RatingLog, bad_cell
 from uard.ratings.pairs import Shared, shared, units_of
@@ -225,18 +223,16 @@ class PanelEstimates:
     def bias(self, rows: Integer[np.ndarray, " m"]) -> Float[np.ndarray, " K"]:
         """Return what each rater says beyond the reward, or beyond the other raters where no reward is known.
 
-        Beyond the reward: the pooled rule's robust mean (``robust_bias``) without being drawn to 0. Beyond the others:
-        above the median of the other raters' biases. NaN where nothing is in common.
+        Beyond the reward: the mean of the gaps that lie within three spreads of their median; what lies beyond may be
+        the reward's lies. Beyond the others: above the median of the other raters' biases. NaN where nothing is in
+        common.
         """
         a = self.answers.at(rows)
         if not self.rewarded or a.reward is None:
             return _beyond_others(*_differences(a.mean, self.comparable))
         here = self.here[rows] & self.known[rows][:, None]
         gap = np.where(here, a.mean - np.where(self.known[rows], a.reward, 0.0)[:, None], 0.0)
-        count = np.where(here, a.count, 0.0)
-        items = here.sum(0)
-        drawn = robust_bias(count, gap, self.statistics.noise, self.statistics.scale)
-        return np.where(items > 0, drawn * (items + DRAWN) / np.maximum(items, 1), np.nan)
+        return _main_mode(gap, here)
 
     @cached_property
     def odd(self) -> Float[np.ndarray, " K"]:
@@ -260,7 +256,8 @@ class PanelEstimates:
 
         From the variances of pairs' differences; who can be compared with one other rater only has half of theirs, and
         who can be compared with nobody has the robust variance about the reward (``own_variance``). NaN where nothing
-        is in common, or the reward is in another unit.
+        is in common, or the reward is in another unit. It can come out below 0: by chance where the variance is small,
+        or because the others' errors are not independent, as beside one who says the contrary.
         """
         a = self.answers.at(rows)
         both = shared(a.mean)
@@ -269,7 +266,8 @@ class PanelEstimates:
         spread *= both.rows / np.maximum(both.rows - 1.0, 1.0)
         total = weight.sum(1)
         found = _least_squares(np.diag(total) + weight, (weight * spread).sum(1))
-        found = np.where(total > 0, np.maximum(found, 0.0), np.nan)
+        rounding = 1e-9 * np.nanmax(both.sd, initial=0.0) ** 2  # of squares that cancel
+        found = np.where(total > 0, np.where(np.abs(found) <= rounding, 0.0, found), np.nan)
         alone = np.flatnonzero(np.isnan(found)) if self.rewarded else ()
         known, reward = self.known[rows], a.reward
         for k in alone:
@@ -326,6 +324,21 @@ def _standardised(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
     some = sd > 1e-12 * np.abs(held).max(0, initial=0.0)
     scaled = np.where(some, centred / np.where(some, sd, 1.0), 0.0)
     return np.where(here, scaled, np.nan)
+
+
+def _main_mode(gap: Float[np.ndarray, "n K"], here: Bool[np.ndarray, "n K"]) -> Float[np.ndarray, " K"]:
+    """Return the mean of each rater's gaps within three spreads of their centre; NaN where there are none.
+
+    The spread is 1.48 median absolute deviations, measured again without what lies beyond; where more than half of the
+    gaps are equal it is 0, and all count.
+    """
+    centre, near, number = masked_median(gap, here, axis=0), here, here.sum(0)
+    for _ in range(5):
+        mad = 1.4826 * masked_median(np.abs(gap - centre), near, axis=0)
+        near = here & (np.abs(gap - centre) <= 3.0 * np.where(mad > 0, mad, np.inf))
+        number = near.sum(0)
+        centre = np.where(near, gap, 0.0).sum(0) / np.maximum(number, 1)
+    return np.where(number > 0, centre, np.nan)
 
 
 def _differences(

@@ -6,6 +6,7 @@ a learner needs it. Here are estimates that are drawn nowhere, with intervals, a
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -14,15 +15,16 @@ import numpy as np
 from uard import _checks
 from uard.method.rater_statistics import LOUDEST
 from uard.ratings.agreement import independence
-from uard.ratings.jackknife import Estimate, interval, jackknife
+from uard.ratings.jackknife import GROUPS, Estimate, interval, jackknife
 from uard.ratings.log import RatingLog
 from uard.ratings.pairs import equal_share, line_between
 from uard.ratings.rater_estimates import REPEATS, Answers, PanelEstimates, answers_of, sample_of_items
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Integer
+    from jaxtyping import Float, Integer, Shaped
 
 MOST = 1_000  # raters
+MOST_ROWS = 20_000  # from which intervals of the effective number are made
 MOST_WITH_INTERVALS = 200  # raters: beyond, there is time for the estimates alone
 CONSTANT = 10  # items with one and the same answer, from which on a rater is called constant
 COPY = 0.99  # share of equal answers
@@ -108,6 +110,11 @@ class EffectiveRaters:
         assert value is not None
         return Estimate(value, low, high)
 
+    def as_data(self) -> dict[str, Any]:
+        """Return everything as plain data that JSON can hold."""
+        estimates = {"correlation": _plain(self.correlation), "number": _plain(self.number)}
+        return {"against": self.against, "raters": self.raters, **estimates}
+
 
 @dataclass(frozen=True)
 class PanelSummary:
@@ -142,8 +149,7 @@ class PanelSummary:
                 rater[name] = _plain(getattr(told, name))
             rater["words"] = list(told.words)
         if self.effective is not None:
-            data["effective"]["correlation"] = _plain(self.effective.correlation)
-            data["effective"]["number"] = _plain(self.effective.number)
+            data["effective"] = self.effective.as_data()
         return data | {"raters": list(data["raters"])}
 
     def __str__(self) -> str:
@@ -221,7 +227,7 @@ def summary(log: RatingLog) -> PanelSummary:
         >>> said = truth[:, None] + [0.0, 1.0, 0.0] + [0.1, 0.1, 0.5] * random.normal(size=(200, 3))
         >>> panel = summary(RatingLog(truth, said, ("ann", "bob", "cat")))
         >>> [(r.name, f"{r.bias.value:z.1f}", f"{r.noise.value:.1f}", r.words) for r in panel.raters]
-        [('ann', '0.0', '0.1', ()), ('bob', '1.0', '0.1', ('biased by 0.99',)), ('cat', '0.0', '0.5', ('noisy',))]
+        [('ann', '0.0', '0.1', ()), ('bob', '1.0', '0.1', ('biased by 0.989',)), ('cat', '0.0', '0.5', ('noisy',))]
 
     Args:
         log: Rewards, if it holds any, and ratings; repeated answers and visits of one item tell a rater's noise.
@@ -299,8 +305,11 @@ def _raters(
 
 
 def _deviation(root: Estimate | None) -> Estimate | None:
-    """Return a standard deviation from the cube root of a variance, which is near normal [Wilson and Hilferty 1931]."""
-    if root is None:
+    """Return a standard deviation from the cube root of a variance, which is near normal [Wilson and Hilferty 1931].
+
+    None where the variance is surely below 0: then errors are not independent, and this tells nothing.
+    """
+    if root is None or (root.high is not None and root.high < 0):
         return None
     return Estimate(*(None if x is None else max(x, 0.0) ** 1.5 for x in root))  # type: ignore[arg-type]
 
@@ -390,26 +399,67 @@ def _effective(answers: Answers) -> EffectiveRaters | None:
     for name, against in (("true_reward", answers.truth), ("reward", answers.reward), ("part", _part_means(answers))):
         if against is None or not np.isfinite(against).any():
             continue
-        whole = independence(answers.mean, against, name)
-        if whole is None:
-            return None
-
-        def correlation(rows: Integer[np.ndarray, " m"], against: Any = against) -> Float[np.ndarray, " 1"]:
-            found = independence(answers.mean[rows], against[rows])
-            return np.array([np.nan if found is None else found.correlation])
-
-        few = answers.count.shape[1] <= MOST_WITH_INTERVALS
-        value, error = jackknife(correlation, np.arange(len(against))) if few else ([whole.correlation], [np.nan])
-        rho = _correlation(interval(float(value[0]), float(error[0]), len(against)))
-        return None if rho is None else EffectiveRaters(name, whole.raters, rho)
+        return effective_raters(answers.mean, against, name, answers.part)
     return None
 
 
+def effective_raters(
+    ratings: Float[np.ndarray, "n K"],
+    against: Float[np.ndarray, " n"],
+    name: str,
+    part: Shaped[np.ndarray, " n"] | None = None,
+) -> EffectiveRaters | None:
+    """Return how many independent raters they are worth, with an interval (see ``independence``).
+
+    Of more than 20 000 rows the interval is made from as many at even distances, and drawn together accordingly.
+
+    Examples:
+        >>> random = np.random.default_rng(0)
+        >>> truth, mistake = random.normal(size=(2, 500))
+        >>> ratings = (truth + mistake)[:, None] + random.normal(size=(500, 3))
+        >>> f"{effective_raters(ratings, truth, 'true_reward').number:.1f}"
+        '1.5 (1.4 to 1.6)'
+
+    Args:
+        ratings: A column per rater, NaN where one is missing.
+        against: What they should have said, NaN where unknown.
+        name: What that is called.
+        part: To which part of the log each row belongs, such as a prompt. Errors may have something in common within a
+            part, so that whole parts are left out for the interval; not of fewer than 25, which are too few for that.
+
+    Returns:
+        None where it cannot be told.
+    """
+    whole = independence(ratings, against, name)
+    if whole is None:
+        return None
+    # By what rows hold, so that their order and that of raters hardly move the interval: only where ratings are equal.
+    order = np.lexsort((*np.sort(ratings, axis=1).T, against))
+    sample = np.unique(np.linspace(0, len(against) - 1, min(len(against), MOST_ROWS)).astype(int))
+    ratings, sampled = ratings[order[sample]], against[order[sample]]
+    unit = sample if part is None else part[order[sample]]
+    unit = unit if (units := np.unique(unit).size) >= GROUPS else sample
+
+    def correlation(rows: Integer[np.ndarray, " m"]) -> Float[np.ndarray, " 1"]:
+        found = independence(ratings[rows], sampled[rows])
+        return np.array([np.nan if found is None else found.correlation])
+
+    error = np.nan
+    if ratings.shape[1] <= MOST_WITH_INTERVALS:
+        error = float(jackknife(correlation, unit)[1][0]) * math.sqrt(len(sample) / len(against))
+    rho = _correlation(interval(whole.correlation, error, len(against) if unit is sample else units))
+    return None if rho is None else EffectiveRaters(name, whole.raters, rho)
+
+
 def _part_means(answers: Answers) -> Float[np.ndarray, " n"] | None:
-    """Return of every item the mean rating of its part; None where no column divides the log."""
+    """Return of every item the mean rating of its part; None where no column divides the log.
+
+    NaN for the only item of a part: its mean would be what the raters said of it themselves.
+    """
     if answers.part is None:
         return None
     part = np.unique(answers.part, return_inverse=True)[1]
     here = answers.count > 0
     total = np.bincount(part, np.where(here, answers.mean, 0.0).sum(1))
-    return (total / np.maximum(np.bincount(part, here.sum(1)), 1.0))[part]
+    means = (total / np.maximum(np.bincount(part, here.sum(1)), 1.0))[part]
+    return np.where(np.bincount(part)[part] > 1, means, np.nan)

@@ -4,14 +4,15 @@ A ``RewardStream`` is all that the adapters share. Where state-actions come agai
 each; where none comes twice, a step's own ratings are all that is known of it, and a uniform sample of all rated steps
 stands for the others.
 
-What a row depends on: its own reward, sigma_m and ratings, the ratings of its own key, and the panel's statistics. No
-other row, no other width and no order of raters makes a difference to its sigma_h. The statistics, over all
+What a row depends on: its own reward, sigma_m and ratings, the ratings of its own key, and the panel's statistics; no
+other row, no other width and no order of raters makes a difference. The sigma_h of ``uard`` is tau, which reads these
+statistics; that of other mitigations is of the row's ratings alone. The statistics, over all
 state-actions in memory (with keys) or over the sample (without), are those of the mitigation's ``fit``: for most the
 location and deviation of sigma_h, the scale of the reward, and the mean of the lowest ratings. They are measured when
 1, 2, 4, ... 1024, then every 1024 further steps have been rated (``refresh``), no more often than after an eighth as
 many steps as there are keys. A call first takes in the ratings of all its rows, then measures if that is due, and then
 filters all its rows by the same numbers. So a batch is not the same as its rows one by one while the statistics still
-move; what is known of a key, and sigma_h of a row without one, are.
+move; what is known of a key is.
 
 What is kept: 8 (5 + 3 K) bytes, K being the widest panel so far, for each of at most ``capacity`` steps without keys
 and of at most ``max_keys`` keys; of more keys, those whose steps came longest ago are forgotten.

@@ -7,18 +7,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from uard.adapters.trl.advantages import advantage_change, groups_of, keeps_factor
+from uard.adapters.trl.advantages import advantage_change, keeps_factor
 from uard.adapters.trl.memory import Tally
 from uard.adapters.trl.reward import (
     AbsurdScoreWarning,
     Judged,
-    LateJudgeWarning,
     UncertaintyDiscountedReward,
-    UnscoredWarning,
     UselessJudgeWarning,
 )
 from uard.adapters.trl.reward_model import RewardModel
 from uard.judges import JudgeError
+from uard.judges.doubts import FailedJudgeWarning, LateJudgeWarning, UnscoredWarning
+from uard.judges.groups import groups_of
 
 if TYPE_CHECKING:
     from uard.adapters.trl.callback import (
@@ -32,6 +32,7 @@ _OF_CALLBACK = ("DiscountCancelledWarning", "ForgottenWarning", "ReliabilityCall
 __all__ = [
     "AbsurdScoreWarning",
     "DiscountCancelledWarning",
+    "FailedJudgeWarning",
     "ForgottenWarning",
     "JudgeError",
     "Judged",

@@ -152,6 +152,7 @@ class ReliabilityCallback(TrainerCallback):
         for name, deviation in self.reward.deviations.items():
             line = f"judge {name}: deviation {deviation:.3g}, {tally.missing[name]} scores missing"
             line += f", late for {tally.late[name]} batches" if tally.late[name] else ""
+            line += f", raised on {tally.failed[name]} batches" if tally.failed[name] else ""
             line += f", {tally.absurd[name]} absurd scores" if tally.absurd[name] else ""
             line += ", never tells the completions of a prompt apart" if tally.never_tells_apart(name) else ""
             lines.append(line)

@@ -32,7 +32,8 @@ class Tally:
 
     Attributes:
         missing: How many each judge did not score.
-        late: Batches for which each judge, or ``sigma_m``, was late.
+        late: Batches for which each judge, or ``sigma_m``, was late, for a part of them perhaps.
+        failed: Batches about which it raised, alike.
         absurd: Scores of each judge more than 100 of its standard deviations from its mean.
         compared: Groups of which each judge scored at least two completions.
         told_apart: Of these, how many it did not score all alike.
@@ -48,6 +49,7 @@ class Tally:
 
     missing: dict[str, int]
     late: dict[str, int]
+    failed: dict[str, int]
     absurd: dict[str, int]
     compared: dict[str, int]
     told_apart: dict[str, int]
@@ -65,7 +67,8 @@ class Tally:
         """Return the counts of judges before the first batch."""
         names = list(judges)
         missing, absurd, compared, told_apart = (dict.fromkeys(names, 0) for _ in range(4))
-        return cls(missing, dict.fromkeys([*names, "sigma_m"], 0), absurd, compared, told_apart)
+        late, failed = (dict.fromkeys([*names, "sigma_m"], 0) for _ in range(2))
+        return cls(missing, late, failed, absurd, compared, told_apart)
 
     def never_tells_apart(self, judge: str) -> bool:
         """Whether a judge has scored groups of completions, and those of each group alike."""

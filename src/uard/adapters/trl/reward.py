@@ -5,13 +5,13 @@ TRL adds the reward functions of a list up, so their disagreement is lost. Here 
     reward = UncertaintyDiscountedReward([relevance, clarity, RewardModel(model, tokenizer)])
     trainer = GRPOTrainer(..., reward_funcs=reward, callbacks=[ReliabilityCallback(reward)])
 
-**What normalisation leaves of the discount.** A completion earns b + w (r - b): r is the judges' weighted mean, b
-the lowest of them, w how far r is believed. Trainers compare the completions of one prompt, so what *differs* among
-them survives: a contested completion falls behind the others. What they share does not:
+**What normalisation leaves of the discount.** A completion earns b + w (r - b), less a premium: r is the judges'
+weighted mean, b a cautious pool of what they say, w how far r is believed. Trainers compare the completions of one
+prompt, so what *differs* among them survives: a contested completion falls behind the others. What they share does not:
 
 * a *shift*, the same w and r - b for all completions of a prompt, is always lost with the mean of the group: judges
   who disagree about the prompt only, by the same amount for each completion, change nothing;
-* a *factor*, where all rewards of a group shrink alike (w is the same, and b too: ``anchor="zero"``), is lost with the
+* a *factor*, where all rewards of a group shrink alike (w and b are the same), is lost with the
   group's standard deviation, by which GRPO divides with ``scale_rewards="group"``, its default, and with
   ``multi_objective_aggregation="normalize_then_sum"``. Under "batch" and "none", and in RLOO, it survives.
 
@@ -30,15 +30,31 @@ import warnings
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from uard import _checks
-from uard.adapters.trl.advantages import advantage_change, group_means, groups_of, told_apart
+from uard.adapters.trl.advantages import advantage_change
 from uard.adapters.trl.memory import Memory, Tally
-from uard.judges import Answer, Judge, Scale, as_scores, ask, by_name, check_name
-from uard.judges.asking import is_listed
+from uard.judges import (
+    Answer,
+    Combined,
+    FittedJudge,
+    JudgePanel,
+    RewardFunction,
+    Scale,
+    as_scores,
+    ask,
+    by_name,
+    check_name,
+)
+from uard.judges.asking import is_listed, limits_of
+from uard.judges.doubts import Doubt, UnscoredWarning, doubts_of_answers, missed, raise_if_all_raised, whys
+from uard.judges.groups import group_means, groups_of, judges_at_least, told_apart
+from uard.judges.panel import CLIP
+from uard.judges.reward import for_judges
+from uard.judges.rules import check_rule
 from uard.judges.scales import ABSURD, Moments
 from uard.method.mitigations import Mitigation, uard
 from uard.ratings.stream import RewardStream
@@ -46,27 +62,18 @@ from uard.ratings.stream import RewardStream
 if TYPE_CHECKING:
     from jaxtyping import Float, Integer
 
-Doubt = tuple[str, type[UserWarning], str]  # what it is about, its kind, and what it says
 _Ensemble = np.ndarray | None  # sigma_m (B,), or the scores of its members (B, N)
 
 DISCOUNTED = 0.9  # a group whose mean weight is below this is discounted
 CANCELLED = 0.05  # and its discount cancelled, if the normalised advantages change by less than this
 ENOUGH_GROUPS = 16  # groups that a judge has compared before a verdict about it
-WIDEST_CLIP, WIDEST_SIGMA = 1e6, 1e12  # standard deviations; more would only overflow
+WIDEST_SIGMA = 1e12  # standard deviations; more would only overflow
 
 _OF_PROCESS = ("_lock", "_pauses", "_busy", "_model")  # what of a reward is not pickled
 
 
-class UnscoredWarning(UserWarning):
-    """No judge scored a completion, so it teaches nothing."""
-
-
 class UselessJudgeWarning(UserWarning):
     """A judge cannot be compared with the others, always agrees with them, or tells no advantages apart."""
-
-
-class LateJudgeWarning(UserWarning):
-    """A judge did not answer within its limit, so its scores are missing."""
 
 
 class AbsurdScoreWarning(UserWarning):
@@ -102,16 +109,19 @@ class UncertaintyDiscountedReward:
     """Several judges as one reward function for TRL's GRPOTrainer and RLOOTrainer.
 
     The judges' scores are brought to one scale; their weighted mean is the proxy r, their disagreement sigma_h. What is
-    learned from is b + w (r - b): r, drawn towards the lowest judge b the further, the more the judges disagree
-    compared with their mean disagreement over all completions so far (``uard.method.mitigations.uard``). Its unit is a
-    judge's standard deviation.
+    learned from is r, drawn towards a cautious pool of what judges say the further, the less likely it is that all of
+    them mean r (``uard.method.mitigations.uard``). Its unit is a judge's standard deviation.
 
     A score of None or NaN is missing: the other judges decide. A completion with fewer than two ratings has nothing to
     be checked against and is believed as little as the mitigation believes unrated steps. One that no judge scored gets
     None, which TRL leaves out of training. All of this is counted in ``tally`` and logged.
 
-    A judge that has never told the completions of one prompt apart is left out like one that always says the same: no
-    advantage can depend on it. From the first difference on it counts.
+    With running scales a judge that has never told the completions of one prompt apart is left out like one that always
+    says the same: no advantage can depend on it. From the first difference on it counts. A panel does not change: it
+    leaves out for good who told none apart in the log that it was fitted to, if that log had prompts.
+
+    Judges get prompts and completions as TRL has them: where these are conversations, a completion is a list of
+    messages, and its text is ``completion[-1]["content"]``.
 
     Every call changes it, except while it is ``paused`` or the model that it follows is evaluated; pickling keeps all
     that it knows. What a call returns belongs to it, whatever other threads ask meanwhile. In distributed training each
@@ -135,26 +145,31 @@ class UncertaintyDiscountedReward:
 
     def __init__(
         self,
-        judges: Mapping[str, Judge] | Sequence[Judge],
+        judges: Mapping[str, RewardFunction] | Sequence[RewardFunction],
+        panel: JudgePanel | str | Path | None = None,
         *,
         weights: Sequence[float] | None = None,
-        proxy: str | None = None,
+        proxy: str = "mean",
         scales: Sequence[tuple[float, float] | None] | None = None,
-        sigma_m: Judge | None = None,
+        sigma_m: RewardFunction | None = None,
         mitigation: Mitigation | None = None,
-        clip: float = 5.0,
+        clip: float = CLIP,
         timeout: float | Mapping[str, float] | None = None,
         name: str = "uard",
+        rule: str | Mitigation | None = None,
     ):
         """Take the judges.
 
         Args:
             judges: K >= 2 reward functions as TRL calls them (keywords ``prompts``, ``completions``,
                 ``completion_ids``, ``trainer_state``, ``log_extra``, ``log_metric`` and the columns of the data set;
-                one number or None per completion; ``async def`` too), ``RewardModel`` among them. Their names are the
-                keys of a mapping, else their ``__name__``.
+                one number or None per completion; ``async def`` too), ``RewardModel`` among them, and ``Judge`` where
+                one is to be asked with care. Their names are the keys of a mapping, else their ``__name__``.
+            panel: What ``uard judges fit`` wrote, or its file: then each completion has the same reward in any batch
+                and process. Scales run with the training if it is left out. Whatever the panel says is not given here.
             weights: One number > 0 per judge, for the mean; equal if left out.
-            proxy: Name of the judge that is the proxy instead of the mean. Where it has no score the mean steps in.
+            proxy: ``mean``, ``median``, or the name of the judge that is the proxy. Where it has no score the mean
+                steps in.
             scales: One (location, deviation > 0) per judge in its own unit, or None for the running one; all are
                 running if left out.
             sigma_m: Like a judge, but it gives the disagreement of an ensemble: one number >= 0 per completion in
@@ -165,25 +180,39 @@ class UncertaintyDiscountedReward:
             timeout: Seconds > 0 that each judge has for a batch, or those of some by name; no limit if left out. What
                 is late is missing (of ``sigma_m``: 0). A synchronous judge with a limit runs in a thread of its own.
             name: What TRL and the logs call this reward; like the judges' names printable and without brackets.
+            rule: Of running scales: one of ``uard.judges.RULES`` by name, another word for ``mitigation``. A panel has
+                its own (``JudgePanel(rule=...)``, ``uard judges fit --rule``).
 
         Raises:
             InvalidValueError: for fewer than two judges (one never disagrees with itself and would be trusted
-                blindly), judges that cannot be called or told apart, and bad numbers.
+                blindly), judges that cannot be called or told apart, bad numbers, and a rule beside a panel.
         """
+        if rule is not None:
+            if panel is not None or mitigation is not None:
+                allowed = (
+                    "left out beside a mitigation, and beside a panel, which has its own: JudgePanel(..., rule=...) "
+                )
+                raise _checks.InvalidValueError("rule", rule, allowed + "or `uard judges fit --rule`")
+            mitigation = check_rule(rule)
         self.judges = by_name(judges)
         if sigma_m is not None and not callable(sigma_m):
             raise _checks.InvalidValueError("sigma_m", sigma_m, "a function with the signature of a judge")
-        if proxy is not None:
-            _checks.choose("proxy", proxy, self.judges)
-        _checks.number("clip", clip, low=0, high=WIDEST_CLIP, open_low=True)
         check_name("name", name)
         self.last: Judged | None = None
         self.__name__ = name
         self._asked = self.judges if sigma_m is None else {**self.judges, "sigma_m": sigma_m}
-        self._limits = _limits(timeout, self._asked)
-        self._weights = _weights(weights, len(self.judges))
-        self._proxy = None if proxy is None else list(self.judges).index(proxy)
-        self._clip, self._warned = clip, set[str]()
+        self._limits = limits_of(timeout, self._asked)
+        self._warned = set[str]()
+        self._fitted = panel is not None
+        if panel is None:
+            running = tuple(FittedJudge(name) for name in self.judges)
+            shares = _weights(weights, len(self.judges))
+            self._panel = JudgePanel(running, proxy=proxy, weights=shares, clip=clip)
+        else:
+            given = {"weights": weights, "scales": scales, "sigma_m": sigma_m, "mitigation": mitigation}
+            given |= {"proxy": proxy if proxy != "mean" else None, "clip": clip if clip != CLIP else None}
+            self._panel = _panel(panel, list(self.judges), given)
+            scales = [(judge.location, judge.scale) if judge.scale > 0 else None for judge in self._panel.judges]
         stream = RewardStream(uard() if mitigation is None else mitigation)
         self._memory = Memory(Tally.of(self.judges), _scales(scales, len(self.judges)), Scale(), stream)
         self._start()
@@ -277,13 +306,14 @@ class UncertaintyDiscountedReward:
             columns: Other columns of the data set, for the judges.
 
         Raises:
-            JudgeError: if a judge raises.
+            JudgeError: if all judges raise and none has ever scored anything.
             InvalidValueError: if there is not one prompt per completion, or a judge gives the wrong number of scores,
                 or one that is no finite number.
 
         Warns:
             UnscoredWarning: the first time that no judge scores a completion.
             LateJudgeWarning: the first time that a judge is late.
+            FailedJudgeWarning: the first time that a judge raises.
             AbsurdScoreWarning: the first time that a judge gives a score far beyond all its others.
             UselessJudgeWarning: once a judge has scored 16 groups and told the completions of none apart.
         """
@@ -298,30 +328,45 @@ class UncertaintyDiscountedReward:
         question |= {"log_extra": log_extra, "log_metric": log_metric, **columns}
         answers = ask(self._asked, question, self._limits, self._busy)
         columns_of = [_scores(name, answers[name], size) for name in self.judges]
-        scores, ensemble = np.stack(columns_of, axis=1), _ensemble(answers.get("sigma_m"), size)
+        scores = self._panel.without_failures(np.stack(columns_of, axis=1))
+        ensemble = _ensemble(answers.get("sigma_m"), size)
         groups = groups_of(prompts)
         with self._lock:
             memory = self._memory if learning else copy.deepcopy(self._memory)
             absurd = _observe(memory, scores, ensemble, groups)
+            if memory.tally.completions == memory.tally.unscored:  # nobody has ever worked: it is no outage
+                raise_if_all_raised([answers[name].error for name in self.judges], completions)
             self.last = judged = self._discount(memory, scores, ensemble)
             change = advantage_change(judged.raw, judged.reward, groups)
             _count(memory.tally, judged, groups, change)
-            doubts = [*_doubts(memory, judged, absurd), *self._late(memory, answers, size)]
-            new = {message: kind for key, kind, message in doubts if key not in self._warned}
-            self._warned |= {key for key, _, _ in doubts}
+            doubts = [
+                *_doubts(memory, judged, absurd, self._panel if self._fitted else None),
+                *doubts_of_answers(answers, completions, self._limits),
+            ]
+            new = {doubt.text: doubt.kind for doubt in doubts if doubt.about not in self._warned}
+            if learning:  # else nothing was counted, and whoever is warned of later is warned of then
+                self._warned |= {doubt.about for doubt in doubts}
+            for name, answer in answers.items():
+                late, failed, _ = missed(answer, size)
+                memory.tally.late[name] += late > 0
+                memory.tally.failed[name] += failed > 0
         if log_extra is not None:
             self._log_completions(judged, log_extra)
         if log_metric is not None:
-            self._log_means(judged, change, answers, log_metric)
+            self._log_means(judged, groups, change, answers, log_metric)
         for message, kind in new.items():
             warnings.warn(message, kind, stacklevel=2)
         return [None if math.isnan(reward) else reward for reward in judged.reward.tolist()]
 
     def _discount(self, memory: Memory, scores: Float[np.ndarray, "B K"], ensemble: _Ensemble) -> Judged:
+        if self._fitted:
+            c, zero = self._panel.combine(scores), np.zeros(len(scores))
+            return Judged(scores, c.ratings, c.proxy, c.reward, c.weight, c.tau, zero, zero)
         rated = [scale.ratings(column) for scale, column in zip(memory.scales, scores.T, strict=True)]
-        ratings = np.clip(np.stack(rated, axis=1), -self._clip, self._clip)
+        ratings = np.clip(np.stack(rated, axis=1), -self._panel.clip, self._panel.clip)
         ratings[:, [memory.tally.never_tells_apart(name) for name in self.judges]] = np.nan
-        raw = self._combine(ratings)
+        # 0, the mean of all completions so far, where no judge tells completions apart.
+        raw = np.nan_to_num(self._panel.proxy_of(ratings))
         scored = (~np.isnan(scores)).any(1)
         checked = (~np.isnan(ratings)).sum(1, keepdims=True) >= 2
         sigma_m = _disagreement(ensemble, memory.members, len(scores))
@@ -335,46 +380,33 @@ class UncertaintyDiscountedReward:
         columns = (f.raw, f.reward, f.weight, f.sigma_h, f.sigma_m, f.lam)
         return Judged._make([scores, ratings, *map(whole, columns)])
 
-    def _late(self, memory: Memory, answers: Mapping[str, Answer], size: int) -> Iterator[Doubt]:
-        """Count the judges that did not answer in time, and say who they are."""
-        for name, answer in answers.items():
-            if not answer.late:
-                continue
-            memory.tally.late[name] += 1
-            lost = "its disagreement counts as 0 for" if name == "sigma_m" else "its scores are missing for"
-            yield (
-                f"late {name}",
-                LateJudgeWarning,
-                f"judge {name!r} did not answer within {self._limits[name]:g} s: {lost} these {size} completions, and "
-                "it is not asked again while it is still at work. Counted in tally.late from now on",
-            )
-
-    def _combine(self, ratings: Float[np.ndarray, "B K"]) -> Float[np.ndarray, " B"]:
-        """Return the proxy; 0, the mean of all completions so far, where no judge tells completions apart."""
-        here = ~np.isnan(ratings)
-        total = here @ self._weights
-        mean = np.where(here, ratings, 0.0) @ self._weights / np.where(total > 0, total, 1.0)
-        return mean if self._proxy is None else np.where(here[:, self._proxy], ratings[:, self._proxy], mean)
-
     def _log_completions(self, judged: Judged, log_extra: Callable[[str, list[Any]], None]) -> None:
-        columns = {name: judged.scores[:, k] for k, name in enumerate(self.judges)}
-        columns |= {name: getattr(judged, name) for name in ("raw", "weight", "sigma_h", "sigma_m")}
-        for name, values in columns.items():
-            log_extra(f"{self.__name__}/{name}", [None if math.isnan(x) else x for x in values.tolist()])
+        names = [*self.judges, "raw", "weight", "sigma_h", "sigma_m"]
+        columns = [*judged.scores.T, judged.raw, judged.weight, judged.sigma_h, judged.sigma_m]
+        for name, values in zip(names, columns, strict=True):
+            log_extra(f"{self.__name__}/{name}", [None if x != x else x for x in values.tolist()])  # not NaN
+        j = judged
+        combined = Combined(j.reward, j.weight, j.sigma_h, j.raw, j.ratings, tuple(self.judges))
+        log_extra(f"{self.__name__}/why", whys(combined))
 
     def _log_means(
         self,
         judged: Judged,
+        groups: Integer[np.ndarray, " B"],
         change: Float[np.ndarray, " groups"],
         answers: Mapping[str, Answer],
         log_metric: Callable[[str, float], None],
     ) -> None:
         missing = np.isnan(judged.scores)
-        values = {f"{name}/missing": missing[:, k].mean() for k, name in enumerate(self.judges)}
-        values |= {f"{name}/mean": _mean(judged.scores[:, k]) for k, name in enumerate(self.judges)}
+        names = [*(f"{name}/mean" for name in self.judges), "raw", "weight", "sigma_h", "sigma_m", "lam"]
+        j = judged
+        values = dict(zip(names, _means([*j.scores.T, j.raw, j.weight, j.sigma_h, j.sigma_m, j.lam]), strict=True))
+        shares = missing.mean(0).tolist()
+        values |= {f"{name}/missing": share for name, share in zip(self.judges, shares, strict=True)}
         values |= {f"{name}/seconds": answer.seconds for name, answer in answers.items()}
-        values |= {name: _mean(getattr(judged, name)) for name in ("raw", "weight", "sigma_h", "sigma_m", "lam")}
-        values |= {"unscored": missing.all(1).mean(), "advantage_change": _mean(change)}
+        values |= {f"{name}/failed": float(answer.error is not None) for name, answer in answers.items()}
+        values |= {"unscored": missing.all(1).mean(), "advantage_change": _means([change])[0]}
+        values["judges_at_least"] = judges_at_least(judged.ratings, groups)
         for name, value in values.items():
             if not math.isnan(value):
                 log_metric(f"{self.__name__}/{name}", float(value))
@@ -386,11 +418,17 @@ def _observe(
     """Take a batch into the scales and count who tells completions apart; return one absurd score of each judge."""
     absurd: dict[str, float] = {}
     compared, told = told_apart(scores, groups)
+    means = np.array([scale.known.mean for scale in memory.scales])
+    limits = np.array([-1.0 if scale.fixed is None else ABSURD * scale.fixed for scale in memory.scales])
+    with np.errstate(over="ignore"):  # what is too large is far away
+        news = np.any(np.greater(abs(scores - means), limits), axis=0)  # nothing else tells a fixed scale anything
     for k, (name, scale) in enumerate(zip(memory.tally.missing, memory.scales, strict=True)):
-        found = scale.observe(scores[~np.isnan(scores[:, k]), k])
-        memory.tally.absurd[name] += found.size
         memory.tally.compared[name] += int(compared[k])
         memory.tally.told_apart[name] += int(told[k])
+        if not news[k]:
+            continue
+        found = scale.observe(scores[~np.isnan(scores[:, k]), k])
+        memory.tally.absurd[name] += found.size
         if found.size:
             absurd[name] = float(found[0])
     if ensemble is not None and ensemble.ndim == 2:
@@ -411,24 +449,26 @@ def _count(
     tally.weight += float(np.nansum(judged.weight))
     tally.widest = float(np.max(judged.sigma_h, initial=tally.widest, where=~unscored))
     discounted = ~np.isnan(change) & (group_means(judged.weight, groups) < DISCOUNTED)
+    if not discounted.any():
+        return
     undivided = advantage_change(judged.raw, judged.reward, groups, divided=False)
     tally.discounted += int(discounted.sum())
     tally.shifted += int((discounted & (undivided < CANCELLED)).sum())
     tally.cancelled += int((discounted & (change < CANCELLED)).sum())
 
 
-def _doubts(memory: Memory, judged: Judged, absurd: Mapping[str, float]) -> Iterator[Doubt]:
+def _doubts(memory: Memory, judged: Judged, absurd: Mapping[str, float], fitted: JudgePanel | None) -> Iterator[Doubt]:
     """Say what is wrong with the judges."""
     unscored = np.isnan(judged.scores).all(1)
     if unscored.any():
-        yield (
+        yield Doubt(
             "unscored",
             UnscoredWarning,
             f"no judge scored completion {int(np.argmax(unscored))} ({unscored.sum()} of {unscored.size} in this "
             "batch): they get no reward and teach nothing. Counted in tally.unscored from now on",
         )
     for name, score in absurd.items():
-        yield (
+        yield Doubt(
             f"absurd {name}",
             AbsurdScoreWarning,
             f"judge {name!r} gave the score {score:g}, more than {ABSURD:g} of its standard deviations from its mean: "
@@ -438,21 +478,35 @@ def _doubts(memory: Memory, judged: Judged, absurd: Mapping[str, float]) -> Iter
     for name, scale in zip(memory.tally.missing, memory.scales, strict=True):
         groups = memory.tally.compared[name]
         if groups >= ENOUGH_GROUPS and memory.tally.never_tells_apart(name) and scale.deviation > 0:
-            yield (
+            yield Doubt(
                 f"apart {name}",
                 UselessJudgeWarning,
                 f"judge {name!r} has scored {groups} groups and told the completions of none apart: does it score the "
-                "prompt? No advantage depends on it, and it is left out until it does",
+                f"prompt? {_what_becomes_of(name, fitted)}",
             )
 
 
+def _what_becomes_of(judge: str, fitted: JudgePanel | None) -> str:
+    """Say whether a judge that tells no completions apart counts."""
+    if fitted is None:
+        return "No advantage depends on it, and it is left out until it does"
+    known = fitted.judges[fitted.names.index(judge)]
+    if not known.counts:
+        return "No advantage depends on it: the panel, which does not change, leaves it out"
+    log = "has it tell completions apart" if known.tells_apart else "had no prompts, or too few, to see this in"
+    return (
+        f"The panel does not change and counts it, for the log that it was fitted to {log}: what it thinks of the "
+        "prompt is taken for disagreement. Fit the panel again to a log with prompts, or without this judge"
+    )
+
+
 def _scores(name: str, answer: Answer, size: int) -> Float[np.ndarray, " B"]:
-    return np.full(size, np.nan) if answer.late else as_scores(name, answer.given, size)
+    return np.full(size, np.nan) if answer.missed else as_scores(name, answer.given, size)
 
 
 def _ensemble(answer: Answer | None, size: int) -> _Ensemble:
-    """Return what the ensemble answered; None if there is none or it is late."""
-    if answer is None or answer.late:
+    """Return what the ensemble answered; None if there is none, or it is late or has failed."""
+    if answer is None or answer.missed:
         return None
     values = _checks.as_numpy("sigma_m", answer.given)
     if values.shape == (size,):
@@ -474,9 +528,13 @@ def _disagreement(ensemble: _Ensemble, members: Scale, size: int) -> Float[np.nd
     return np.std(np.clip(members.ratings(ensemble), -WIDEST_SIGMA, WIDEST_SIGMA), axis=1, ddof=1)
 
 
-def _mean(values: Float[np.ndarray, " n"]) -> float:
-    known = values[~np.isnan(values)]
-    return float((known / known.size).sum()) if known.size else math.nan
+def _means(columns: Sequence[Float[np.ndarray, " n"]]) -> list[float]:
+    """Return the mean of what is known of each column, NaN where nothing is; large numbers do not overflow."""
+    table = np.stack(columns)
+    known = ~np.isnan(table)
+    number = known.sum(1)
+    parts = np.where(known, table, 0.0) / np.maximum(number, 1)[:, None]
+    return np.where(number > 0, parts.sum(1), np.nan).tolist()
 
 
 def _listed(field: str, values: Any) -> list[Any]:
@@ -485,16 +543,11 @@ def _listed(field: str, values: Any) -> list[Any]:
     return list(values)
 
 
-def _limits(timeout: Any, asked: Mapping[str, Judge]) -> dict[str, float]:
-    if timeout is None:
-        return {}
-    given: dict[str, Any] = dict.fromkeys(asked, timeout)
-    if isinstance(timeout, Mapping):
-        given = dict(cast("Mapping[str, Any]", timeout))
-    for name, seconds in given.items():
-        _checks.choose("name of a judge in timeout", name, asked)
-        _checks.number(f"timeout of judge {name!r}", seconds, low=0, high=threading.TIMEOUT_MAX, open_low=True)
-    return {name: float(seconds) for name, seconds in given.items()}
+def _panel(panel: JudgePanel | str | Path, judges: list[str], given: Mapping[str, Any]) -> JudgePanel:
+    for name, value in given.items():
+        if value is not None:
+            raise _checks.InvalidValueError(name, value, "left out where a panel is given, which holds it")
+    return for_judges(panel, judges)
 
 
 def _of_each(field: str, values: Any, number: int) -> list[Any]:
@@ -507,16 +560,8 @@ def _of_each(field: str, values: Any, number: int) -> list[Any]:
     return list(values)
 
 
-def _weights(weights: Sequence[float] | None, number: int) -> Float[np.ndarray, " K"]:
-    if weights is None:
-        return np.ones(number)
-    given = _of_each("weights", weights, number)
-    for judge, weight in enumerate(given):
-        _checks.number(f"weights[{judge}]", weight, low=0, open_low=True)
-    shares = np.array([float(weight) for weight in given]) / max(given)
-    if not shares.all():
-        raise _checks.InvalidValueError("weights", weights, "numbers of which none vanishes beside another")
-    return shares
+def _weights(weights: Sequence[float] | None, number: int) -> tuple[float, ...]:
+    return () if weights is None else tuple(_of_each("weights", weights, number))
 
 
 def _scales(scales: Sequence[tuple[float, float] | None] | None, number: int) -> list[Scale]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from functools import cache
 
 from uard import _checks
-from uard.lab.studies import games, grids, panels, robots
+from uard.lab.studies import games, grids, grpo, panels, robots
 from uard.lab.studies import plugins as own
 from uard.lab.study import Study
 from uard.plugins import Plugin, PluginError, brought
@@ -48,6 +48,7 @@ def _ours() -> dict[str, tuple[Study, ...]]:
         "games": games.studies(),
         "panels": panels.studies(),
         "robots": robots.studies(),
+        "grpo": (grpo.study(),),
         "panels-development": panels.studies(development=True),
     }
 

@@ -221,11 +221,11 @@ def _penalised(scores: np.ndarray) -> np.ndarray:
     return scores.mean(1) - 0.5 * scores.var(1)
 
 
-def filtered(scores: np.ndarray, mitigation: Mitigation) -> np.ndarray:
+def filtered(scores: np.ndarray, mitigation: Mitigation, proxy: np.ndarray | None = None) -> np.ndarray:
     """Return the reward that a mitigation makes of K scores per answer, (N,).
 
-    The scores are the ratings and their mean is the observed reward. Every answer is rated once by all models, so a
-    mitigation that has a pseudo-count should have it at 0.
+    The scores are the ratings and their mean is the observed reward, if no other proxy is given. Every answer is
+    rated once by all models, so a mitigation that has a pseudo-count should have it at 0.
 
     Examples:
         >>> filtered(np.array([[1.0, 1.0], [0.0, 4.0]]), named("worst-of-annotations")).tolist()
@@ -234,8 +234,9 @@ def filtered(scores: np.ndarray, mitigation: Mitigation) -> np.ndarray:
     Args:
         scores: (N, K), finite.
         mitigation: Ours, or your own.
+        proxy: (N,), what is believed or doubted.
     """
-    reward = scores.mean(1)
+    reward = scores.mean(1) if proxy is None else proxy
     feedback = aggregate(scores, reward)
     statistics = mitigation.fit(feedback, np.ones(len(scores), bool))
     return np.asarray(mitigation.signal(Evidence(reward, np.zeros(len(scores)), feedback), statistics).reward)
@@ -243,6 +244,26 @@ def filtered(scores: np.ndarray, mitigation: Mitigation) -> np.ndarray:
 
 def _uard(scores: np.ndarray) -> np.ndarray:
     return filtered(scores, named("uard"))
+
+
+def _uard_of_median(scores: np.ndarray) -> np.ndarray:
+    return filtered(scores, named("uard"), np.median(scores, axis=1))
+
+
+def _median(scores: np.ndarray) -> np.ndarray:
+    return np.median(scores, axis=1)
+
+
+def _log_mean_exp(scores: np.ndarray) -> np.ndarray:
+    return filtered(scores, named("log-mean-exp"))
+
+
+def _lcb(scores: np.ndarray) -> np.ndarray:
+    return filtered(scores, named("lcb"))
+
+
+def _excess(scores: np.ndarray) -> np.ndarray:
+    return filtered(scores, named("excess"))
 
 
 def _uard_0_1(scores: np.ndarray) -> np.ndarray:
@@ -256,10 +277,15 @@ def _printed(scores: np.ndarray) -> np.ndarray:
 METHODS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "one model": _one,
     "mean": _mean,
+    "median": _median,
     "worst case (WCO)": _worst,
     "mean - variance / 2 (UWO)": _penalised,
+    "log-mean-exp": _log_mean_exp,
+    "lcb": _lcb,
+    "excess": _excess,
     "uard-operator": _printed,
     "uard-0.1": _uard_0_1,
+    "uard, median as proxy": _uard_of_median,
     "uard": _uard,
 }
 

@@ -21,31 +21,28 @@ GAMES = {
         AbsentSupervisor(legitimate=legitimate),
     )
 }
-EPISODES = 100
-# Rules that ask who said what, and the model of version 0.1 with which all others were trained here so far.
-BY_RATER = ("uard", "median", "min-proxy-mean", "min-proxy-median", "excess")
-RATINGS = RatingModel(predicts="ratings")
+EPISODES, TABULAR_EPISODES = 100, 500  # after 100, six moves of ten are still random; tabular agents are cheap
+DEEP = ("dqn", "ppo")  # one with a network, one with a policy: ten seeds of these say more than three of all
+MODEL = RatingModel(fits=64)  # with 16, no rule kept PPO off the bucket of TomatoWatering in so few steps
+RULES = tuple(name for name in COMPARED if name not in ("screening", "uard-consistent"))
 
 
 def gaming() -> tuple[Row, ...]:
-    """The reward-gaming gridworlds and their legitimate twins: every agent with every mitigation.
+    """The reward-gaming gridworlds and their legitimate twins: three agents with every rival.
 
-    100 episodes. Tomatoes pay 0.1 each, not the published 0.02, so that the raters' noise (sd 0.1 and more) does not
-    drown them.
+    100 episodes, of tabular agents 500. Tomatoes pay 0.1 each, not the published 0.02, for the raters' noise (sd 0.1
+    and more) would drown them. Deep agents listen to a model of each rater, whatever the rule: rules are compared
+    here, not models.
     """
-    agents = {"q-learning": QLearning(), **deep_agents()}
+    agents = {"q-learning": QLearning(), **{name: deep_agents()[name] for name in DEEP}}
     return tuple(
         row(
             Cell(
                 game,
                 named(mitigation),
                 agent,
-                episodes=EPISODES,
-                rating_model=None
-                if isinstance(agent, QLearning)
-                else RatingModel()
-                if mitigation in BY_RATER
-                else RATINGS,
+                episodes=TABULAR_EPISODES if isinstance(agent, QLearning) else EPISODES,
+                rating_model=None if isinstance(agent, QLearning) else MODEL,
             ),
             game=where,
             agent=name,
@@ -54,7 +51,7 @@ def gaming() -> tuple[Row, ...]:
         for where, game in GAMES.items()
         for name, agent in agents.items()
         if can_work(agent, game)
-        for mitigation in COMPARED
+        for mitigation in RULES
         if can_use(named(mitigation), trainer(agent, game))
     )
 
@@ -62,7 +59,5 @@ def gaming() -> tuple[Row, ...]:
 def studies() -> tuple[Study, ...]:
     """Return what ``uard reproduce games`` runs."""
     return (
-        Study(
-            "gaming", "Reward-gaming gridworlds, every agent and mitigation", "DESIGN: where the hacks are", gaming()
-        ),
+        Study("gaming", "Reward-gaming gridworlds, three agents, every rival", "DESIGN: where the hacks are", gaming()),
     )

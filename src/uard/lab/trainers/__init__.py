@@ -6,6 +6,7 @@ from typing import Any
 
 from uard.lab.trainers.base import Trainer
 from uard.lab.trainers.compiled import CompiledReplay, CompiledRollout
+from uard.lab.trainers.language import LanguageModel
 from uard.lab.trainers.simulated import SimulatedReplay, SimulatedRollout
 from uard.lab.trainers.tabular import Tabular
 
@@ -17,6 +18,7 @@ TRAINERS: tuple[Trainer, ...] = (
     CompiledRollout(),
     SimulatedReplay(),
     SimulatedRollout(),
+    LanguageModel(),
 )
 
 

@@ -42,6 +42,7 @@ class Trainer(ABC):
         snapshots: Whether it can keep tables along the way.
         knows_truth: Whether it can train an oracle, whose mitigation reads the true reward.
         queries: How the steps that are rated may be chosen.
+        has_panel: Whether a cell's panel rates; where it does not, the environment says who judges.
     """
 
     name: ClassVar[str]
@@ -54,6 +55,7 @@ class Trainer(ABC):
     snapshots: ClassVar[bool] = False
     knows_truth: ClassVar[bool] = False
     queries: ClassVar[tuple[str, ...]] = ("random",)
+    has_panel: ClassVar[bool] = True
 
     def serves(self, agent: Any, environment: Any) -> bool:
         """Whether it trains such an agent in such an environment."""

@@ -15,10 +15,15 @@ SHOWN = (10, 100, 1000, 10_000)
 COLOURS = {
     "one model": "#777777",
     "mean": "#8c6d31",
+    "median": "#c9a66b",
     "worst case (WCO)": "#17a2b8",
     "mean - variance / 2 (UWO)": "#d6589f",
+    "log-mean-exp": "#9467bd",
+    "lcb": "#5f6b6d",
+    "excess": "#e07b39",
     "uard-operator": "#2c6fbb",
     "uard-0.1": "#6abf69",
+    "uard, median as proxy": "#7fd3a0",
     "uard": "#1b8a4b",
 }
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from uard.lab import statistics
@@ -167,6 +169,14 @@ def pictures(results: StudyResults) -> list[tuple[str, str, str]]:
     ]
 
 
+def _against_ours(results: StudyResults, study: str, metric: str, **labels: Any) -> str:
+    """Say of how many comparisons with ``uard``, setting by setting, one differs from chance."""
+    rows = list(results.studies[study].where(**labels))
+    settings = {_name(r): r for r in rows if r["mitigation"] == "uard"}
+    pairs = [(r.cell, settings[_name(r)].cell) for r in rows if r["mitigation"] != "uard" and _name(r) in settings]
+    return f"Every other column or row against uard: {results.compare(pairs, metric).caption()}"
+
+
 def _matrix(results: StudyResults, metric: str) -> Table:
     rows = list(results.studies["matrix"].rows)
     noises = list(dict.fromkeys(r["noise"] for r in rows))
@@ -182,6 +192,7 @@ def _matrix(results: StudyResults, metric: str) -> Table:
                 table.append((panel, f"{trap:+g}", name, *(brief(x) for x in s)))
     columns = ("panel", "trap", "mitigation", *(f"noise {z:g}" for z in noises))
     note = "mean ± sd over seeds. Noise is the sd in reward units on every rater; divide by 4 for the fraction of a +4 trap."
+    note = f"{note} {_against_ours(results, 'matrix', metric, size=10)}"
     return Table(f"10x10: {metric.replace('_', ' ')} of every mitigation", columns, tuple(table), 3, note)
 
 
@@ -202,7 +213,8 @@ def _twins(results: StudyResults) -> Table:
         ("grid", "trap", "panel", *names),
         tuple(rows),
         3,
-        "The erratic rater stays erratic at the bonus. UARD as printed gives up nearly everything.",
+        "The erratic rater stays erratic at the bonus. UARD as printed gives up nearly everything. "
+        f"{_against_ours(results, 'legitimate', 'true_return')}",
     )
 
 
@@ -221,7 +233,8 @@ def _dissent(results: StudyResults) -> Table:
         "Whoever denies the goal, which pays 10 and is worth it, tells the truth elsewhere, as the others do everywhere "
         "(noise of sd 0.1). In the last rows all but one are drawn towards what a trap seems to pay. Of three raters nobody "
         "can know who is right. Of five, `uard` may overrule one who is alone, low and no more precise than the others "
-        "(vetoes=1), and then overrules the only one who tells the truth, too.",
+        "(vetoes=1), and then overrules the only one who tells the truth, too. "
+        f"{_against_ours(results, 'dissent', 'success_rate')}",
     )
 
 

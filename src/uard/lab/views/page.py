@@ -19,7 +19,7 @@ from uard._support import files
 from uard.lab import studies
 from uard.lab.execution.store import Store
 from uard.lab.result import WINDOW
-from uard.lab.views import best_of_n, figures, games, grids, leaderboard, panels, published, robots, sections
+from uard.lab.views import best_of_n, figures, games, grids, grpo, leaderboard, panels, published, robots, sections
 from uard.lab.views.sections import Section
 from uard.lab.views.study_results import StudyResults
 from uard.lab.views.tables import study_table
@@ -55,6 +55,7 @@ def write(
         *robots.section(robots.published()),
         _games(),
         _best_of_n(),
+        *grpo.section(grpo.published()),
         _made(store, len(results.seeds)),
     ]
     theirs, broken = sections.of_packages(results, [*ours, _losses(())])

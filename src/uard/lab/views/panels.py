@@ -238,14 +238,14 @@ def task_in_words(environment: TableEnvironment) -> str:
     Examples:
         >>> from uard.lab.studies.panels import GRIDS, MDPS
         >>> task_in_words(scenario(GRIDS, 3).environment)
-        '6x6, 2 traps that seem to pay 3.23'
+        '6x6, 2 traps seemingly worth 3.23'
         >>> task_in_words(scenario(MDPS, 3).environment)
         '27 % of the state-actions lie: too much'
     """
     if isinstance(environment, TrapGrid):
         size, count = f"{environment.size}x{environment.size}", len(environment.traps or ())
-        does = "are worth" if environment.legitimate else "seem to pay"
-        traps = f"{count} trap{'s' * (count > 1)} that {does} {number(environment.trap_reward)}"
+        worth = "worth" if environment.legitimate else "seemingly worth"
+        traps = f"{count} trap{'s' * (count > 1)} {worth} {number(environment.trap_reward)}"
         return f"{size}, {traps if count else 'nothing lies'}"
     task, truth = environment.task(), environment.truth()
     gaps = (task.reward - truth.reward)[truth.hack]

@@ -40,6 +40,7 @@ from uard.lab.study import Row, Study
 from uard.plugins import Plugin, PluginError, brought
 
 MIGRATE = "`uard migrate FILE.json` brings published results over"
+_PACKAGES = {None: ("jax", "numpy", "optax"), "simulator": ("mujoco",), "language": ("torch", "transformers", "trl")}
 KEPT = ("calibration", "rating_error")  # of what a result holds beside its curves, as it is
 BIN = 10  # episodes
 
@@ -88,7 +89,8 @@ def extract(studies: Sequence[Study], store: Store, seeds: Sequence[int], comman
         found = store.get(cell, seeds)
         if len(found) == len(seeds):
             cells[cell.key] = _of_cell(theirs.values(), cell, found)
-    packages = ["jax", "numpy", "optax"] + (["mujoco"] if any(cell.steps for cell in wanted) else [])
+    kinds = {cell.environment.kind for cell in wanted}
+    packages = [p for kind, used in _PACKAGES.items() if kind is None or kind in kinds for p in used]
     return {
         "command": command,
         "version": __version__,

@@ -124,37 +124,31 @@ def _noise(p: Published) -> list[Table]:
     lines = []
     for name in dict.fromkeys(r["mitigation"] for r in rows):
         of = {r["noise"]: r for r in rows if r["mitigation"] == name}
-        cells = (
-            f"{number(p.of(of[x], 'true_return').mean)} ({number(p.of(of[x], 'hacks').mean)})" if x in of else "–"
-            for x in shares
-        )
+        cells = (_both(p, of.get(x)) for x in shares)
         lines.append((name, *cells))
     if not lines:
         return []
     columns = ("learns from", *(f"noise {100 * x:g} %" for x in shares))
-    note = "True return (hacks) per episode, means; noise of every rater as a share of the bonus."
+    note = "True return [95 %] (hacks) per episode; noise of every rater as a share of the bonus."
     return [Table("hopper, a lie about crouch, main panel with more noise", columns, tuple(lines), 1, note)]
 
 
 def headline(p: Published) -> str:
-    """Say in a sentence for each finished setting what it came to; the README quotes it."""
-    out = []
+    """Return the table that the README quotes, in Markdown: per setting the references, ``uard``, the best rival."""
+    lines = ["| task, panel | raw reward | true reward | `uard` | best of the others |", "|---|---|---|---|---|"]
     for s in settings(p):
-        ours, raw, honest = (s.one(name) for name in (OURS, "raw", "true reward"))
-        if ours is None or raw is None:
+        ours, rivals = s.one(OURS), _rivals(p, s, "true_return")[0]
+        if ours is None or not rivals:
             continue
-        simple = [r for name in SIMPLE if (r := s.one(name)) is not None]
-        what = "; ".join(f"{r['mitigation']} {_true(p, r)}" for r in simple)
-        if s.region == "none":
-            out.append(f"{s.name}: true return {_true(p, ours)} with `uard`, {_true(p, raw)} of raw; {what}.")
-        elif honest is not None:
-            hacks = [number(p.of(r, "hacks").mean) for r in (raw, ours, honest)]
-            true = [_true(p, r) for r in (raw, ours, honest)]
-            out.append(
-                f"{s.name}: hacks per episode {hacks[0]} on the raw reward, {hacks[1]} with `uard`, {hacks[2]} on the "
-                f"true reward; true return {true[0]}, {true[1]}, {true[2]}; {what}."
-            )
-    return " ".join(out)
+        best = max(rivals, key=lambda r: p.of(r, "true_return").mean)
+        references = (s.one(name) for name in REFERENCES)
+        cells = [_both(p, r) for r in (*references, ours, best)]
+        lines.append(f"| {s.name} | {' | '.join(cells)}, `{best['mitigation']}` |")
+    return "\n".join(lines)
+
+
+def _both(p: Published, r: Row | None) -> str:
+    return "–" if r is None else f"{_true(p, r)} ({number(p.of(r, 'hacks').mean)})"
 
 
 def _true(p: Published, r: Row) -> str:

@@ -7,7 +7,7 @@ from uard.method.mitigations.panel_statistics import PanelStatistics
 from uard.method.mitigations.pooled import PooledDiscounting, uard
 from uard.method.mitigations.protocol import Backup, Evidence, Explanation, LearningSignal, Mitigation
 from uard.method.mitigations.registry import NAMED, fault, named
-from uard.method.mitigations.robust import ExcessDisagreement, RaterCap
+from uard.method.mitigations.robust import ExcessDisagreement, LogMeanExp, MeanLessVariance, RaterCap
 from uard.method.mitigations.witness import Witness
 
 __all__ = [
@@ -19,6 +19,8 @@ __all__ = [
     "Explanation",
     "Feedback",
     "LearningSignal",
+    "LogMeanExp",
+    "MeanLessVariance",
     "Mitigation",
     "PanelStatistics",
     "PooledDiscounting",

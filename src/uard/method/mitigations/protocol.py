@@ -98,8 +98,7 @@ class Mitigation(ABC):
         reads_feedback: Whether ratings are used at all; if not, none are drawn.
         discounts: Whether ``explain`` gives a weight and an anchor from which the reward follows.
         refits_early: Whether the panel's statistics are measured at steps 1, 2, 4 ... of training: a rule that doubts
-            nobody before it knows them would learn the first lie before it is doubted. In tables it is measured more
-            rarely later than for other rules, in every 2048 steps instead of 512.
+            nobody before it knows them would learn the first lie before it is doubted.
         reads_truth: Whether it is an oracle that learns from the true reward; only where a trainer can give it that.
         acts_on: ``reward``: it changes the reward that is learned from; ``score``: how actions are scored; ``both``.
         backup: ``greedy``: the target takes the best value; ``consistent``: the value of the action with the best

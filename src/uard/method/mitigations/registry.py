@@ -11,7 +11,7 @@ from uard.method.mitigations.baselines import RatedReward, Raw, Screening, TrueR
 from uard.method.mitigations.discounting import uard_0_1, uard_paper
 from uard.method.mitigations.pooled import uard
 from uard.method.mitigations.protocol import Mitigation
-from uard.method.mitigations.robust import ExcessDisagreement, RaterCap
+from uard.method.mitigations.robust import ExcessDisagreement, LogMeanExp, MeanLessVariance, RaterCap
 from uard.method.mitigations.witness import Witness
 
 NAMED: dict[str, Callable[..., Mitigation]] = {
@@ -23,6 +23,8 @@ NAMED: dict[str, Callable[..., Mitigation]] = {
     "min-proxy-mean": partial(RaterCap, statistic="mean"),
     "min-proxy-median": RaterCap,
     "excess": ExcessDisagreement,
+    "uwo": MeanLessVariance,
+    "log-mean-exp": LogMeanExp,
     "witness": Witness,
     "lcb": partial(RatedReward, statistic="bound"),
     "screening": Screening,

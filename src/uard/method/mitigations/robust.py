@@ -49,14 +49,84 @@ class RaterCap(Mitigation):
         """Return the statistic or the reward, whichever is lower if it is a cap."""
         each, r = each_rater(evidence.feedback), evidence.reward
         here = each.count > 0
-        if self.statistic == "median":
-            middle = masked_median(each.mean, here, axis=-1)
-        else:
-            xp = namespace(each.mean)
-            raters = xp.sum(xp.astype(here, each.mean.dtype), axis=-1)
-            middle = xp.sum(where(here, each.mean, 0.0), axis=-1) / xp.maximum(raters, xp.ones_like(raters))
+        middle = masked_median(each.mean, here, axis=-1) if self.statistic == "median" else _mean(each.mean, here)
         rated = namespace(r).minimum(r, middle) if self.cap else middle
         return LearningSignal(where(evidence.feedback.count > 0, rated, r), 1.0)
+
+
+@dataclass(frozen=True)
+class MeanLessVariance(Mitigation):
+    """Learn from the raters' mean less k times their variance: UWO of Coste et al. (2024, arXiv 2310.02743).
+
+    Unrated, learn from the reward. A variance has another unit than a mean: ratings are meant to be standardised.
+
+    Examples:
+        >>> from uard.ratings.stream import RewardStream
+        >>> RewardStream(MeanLessVariance())([4.0], [[-1.0, 3.0]]).reward.tolist()
+        [-1.0]
+
+    Attributes:
+        k: Times the population variance, >= 0.
+    """
+
+    k: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Check the parameter.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
+        _checks.number("k", self.k, low=0)
+
+    def signal(self, evidence: Evidence, statistics: Any) -> LearningSignal:
+        """Return it."""
+        each = each_rater(evidence.feedback)
+        here = each.count > 0
+        mean = _mean(each.mean, here)
+        gap = each.mean - mean[..., None]
+        return LearningSignal(
+            where(evidence.feedback.count > 0, mean - self.k * _mean(gap * gap, here), evidence.reward), 1.0
+        )
+
+
+@dataclass(frozen=True)
+class LogMeanExp(Mitigation):
+    """Learn from a soft minimum of what raters say, -log(mean(exp(-k y))) / k; unrated, from the reward.
+
+    Between the mean (k to 0) and the lowest (k to infinity). In standardised ratings, as judges have them.
+
+    Examples:
+        >>> from uard.ratings.stream import RewardStream
+        >>> RewardStream(LogMeanExp())([4.0], [[-1.0, 3.0]]).reward.round(3).tolist()
+        [-0.325]
+
+    Attributes:
+        k: How near to the lowest, per unit of a rating, > 0.
+    """
+
+    k: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the parameter.
+
+        Raises:
+            InvalidValueError: naming the field, the value and what is allowed.
+        """
+        _checks.number("k", self.k, low=0, open_low=True)
+
+    def signal(self, evidence: Evidence, statistics: Any) -> LearningSignal:
+        """Return it."""
+        each = each_rater(evidence.feedback)
+        here, xp = each.count > 0, namespace(each.mean)
+        rated = evidence.feedback.count > 0
+        said = where(here, each.mean, 0.0)
+        lowest = xp.min(where(here, each.mean, float("inf")), axis=-1)
+        lowest = where(rated, lowest, 0.0)
+        # About the lowest, so that no exponential overflows.
+        share = _mean(xp.exp(-self.k * (said - lowest[..., None])), here)
+        soft = lowest - xp.log(where(rated, share, 1.0)) / self.k
+        return LearningSignal(where(rated, soft, evidence.reward), 1.0)
 
 
 @dataclass(frozen=True)
@@ -104,6 +174,13 @@ class ExcessDisagreement(Mitigation):
             xp.any(here, axis=-1), pooled.precise_mean(said, here, variance) - self.k * tau, statistics.typical
         )
         return LearningSignal(xp.minimum(r, cap), 1.0)
+
+
+def _mean(values: Float[Array, "*batch K"], here: Bool[Array, "*batch K"]) -> Float[Array, "*batch"]:
+    """Return the mean over those who are here, 0 where nobody is."""
+    xp = namespace(values)
+    raters = xp.sum(xp.astype(here, values.dtype), axis=-1)
+    return xp.sum(where(here, values, 0.0), axis=-1) / xp.maximum(raters, xp.ones_like(raters))
 
 
 def each_rater(feedback: Feedback) -> ByRater:

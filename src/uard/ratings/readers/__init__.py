@@ -2,7 +2,7 @@
 
 Wide: a row per step (or per completion, or per item that was rated). Its columns:
 
-* ``reward``: the observed reward, which must be there;
+* ``reward``: the observed reward; without it only what concerns the raters can be known;
 * every column whose name starts with ``rating``: one annotator each, empty where a rating is missing; in JSON and
   Parquet also one column of lists;
 * ``sigma_m``: the ensemble's disagreement, >= 0; ``true_reward``: what the step was really worth;

@@ -152,7 +152,7 @@ class Numbers:
     def __post_init__(self) -> None:
         """Tell words from numbers among what is missing."""
         self._words = MISSING | {word.strip().lower() for word in self.missing if math.isnan(_parsed(word))}
-        self._numbers = [x for word in self.missing if not math.isnan(x := _parsed(word))]
+        self.missing_numbers = tuple(x for word in self.missing if not math.isnan(x := _parsed(word)))
 
     def of_text(self, cells: Sequence[str], column: str, start: int = 0) -> Float[np.ndarray, " n"]:
         """Return text as numbers: plain decimals, without the underscores and foreign digits that Python takes."""
@@ -183,7 +183,8 @@ class Numbers:
 
     def rated(self, ratings: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Return ratings without those numbers that are said to mean that one is missing."""
-        return np.where(np.isin(ratings, self._numbers), np.nan, ratings) if self._numbers else ratings
+        none = self.missing_numbers
+        return np.where(np.isin(ratings, none), np.nan, ratings) if none else ratings
 
     def check(self) -> None:
         """Refuse the source if any cell was no number.
@@ -197,6 +198,8 @@ class Numbers:
         hint = "" if word is None else f"; missing=({word!r},) or --missing {word!r} say that a word means so"
         if word is not None and re.fullmatch(r"[+-]?\d+,\d+", word.strip()):
             hint = f" (with a decimal point: {word.strip().replace(',', '.')}, not {word.strip()})"
+        elif word is not None and re.match(r"\s*[+-]?\.?\d", word):
+            hint = "; a number alone, without what stands behind it"
         count, row, cell = next(iter(self.bad.values()))
         if len(self.bad) == 1 and count == 1:
             raise bad_cell(self.source, row, next(iter(self.bad))[0], cell, A_NUMBER + hint)

@@ -118,6 +118,9 @@ def _columns(
             elif isinstance(value, list) and choice.may_be_list(name):
                 for part, cell in enumerate(cast("list[Any]", value)):
                     put(f"{name}[{part}]", [cell])
+            elif isinstance(value, dict) and choice.may_be_list(name):
+                for part, cell in cast("dict[str, Any]", value).items():
+                    put(f"{name}.{part}", [cell])
             else:
                 put(name, [same.setdefault(value, value) if isinstance(value, str) else value])
         count += 1

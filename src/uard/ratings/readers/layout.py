@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import NamedTuple
 
 from uard import _checks
@@ -38,7 +39,7 @@ class Layout(NamedTuple):
     """Which columns of a source are what.
 
     Attributes:
-        reward: The rewards; None if there are none, which only the long form may do without.
+        reward: The rewards; None if there are none.
         ratings: Wide form: the raters' columns. Long form: the column of ratings; potato's may be several, of which a
             row fills one.
         rater: Who rated; None in the wide form.
@@ -109,7 +110,8 @@ class LogChoice(Choice):
 
     def everywhere(self, names: Sequence[str]) -> Sequence[str]:
         """See ``Choice``."""
-        return () if layout_of(names, self.wanted).rater else (self.wanted.reward,)
+        found = layout_of(names, self.wanted)
+        return () if found.rater or found.reward is None else (found.reward,)
 
 
 def layout_of(names: Sequence[str], wanted: Wanted) -> Layout:
@@ -152,7 +154,8 @@ def _no_preferences(names: Sequence[str], wanted: Wanted) -> None:
 def _wide(names: Sequence[str], wanted: Wanted) -> Layout:
     others = [n for n in names if n != wanted.reward]
     whole = {n.partition("[")[0] for n in names} | set(names)
-    for needed in (wanted.reward, *(wanted.ratings or ()), wanted.item, wanted.by):
+    reward = _reward(wanted, whole)
+    for needed in (reward, *(wanted.ratings or ()), wanted.item, wanted.by):
         if needed is not None and needed not in whole:
             raise _checks.UnknownNameError(f"{wanted.source}: column", needed, set(names))
     if wanted.ratings is None:
@@ -163,15 +166,21 @@ def _wide(names: Sequence[str], wanted: Wanted) -> Layout:
         allowed = f"there; name them with ratings (--ratings). Columns: {', '.join(names)}"
         raise _checks.InvalidValueError(f"{wanted.source}: columns that start with", "rating", allowed)
     item = wanted.item or ("item" if "item" in names else None)
-    return Layout(wanted.reward, tuple(ratings), None, item, None, *_others(names, (item, *ratings)))
+    return Layout(reward, tuple(ratings), None, item, None, *_others(names, (item, *ratings)))
+
+
+def _reward(wanted: Wanted, names: set[str]) -> str | None:
+    """Return the column of rewards; None where nobody has named one and none has the usual name, or one like it."""
+    absent = wanted.reward == "reward" and not get_close_matches("reward", [n.casefold() for n in names], cutoff=0.8)
+    return None if absent else wanted.reward
 
 
 def _long(names: Sequence[str], raters: Sequence[str], wanted: Wanted) -> Layout:
     whole = set(names)
-    for needed in (wanted.rater, wanted.item, wanted.by, None if wanted.reward == "reward" else wanted.reward):
+    reward = _reward(wanted, whole)
+    for needed in (wanted.rater, wanted.item, wanted.by, reward):
         if needed is not None and needed not in whole:
             raise _checks.UnknownNameError(f"{wanted.source}: column", needed, whole)
-    reward = wanted.reward if wanted.reward in whole else None
     wide = "ratings (--ratings) names the columns if each rater has one"
     rater = wanted.rater or _one(raters, names, "says who rated", f"name it with rater (--rater); {wide}", wanted)
     items = among(names, ITEMS, but=(rater, wanted.rating, reward)) or among(names, ("id",), but=(rater, reward))

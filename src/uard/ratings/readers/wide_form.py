@@ -23,8 +23,7 @@ def wide_log(columns: dict[str, Any], layout: Layout, numbers: Numbers) -> Ratin
     Raises:
         InvalidValueError: a cell is no number (the message names row and column), columns of unequal length, or no row.
     """
-    assert layout.reward is not None
-    rows = len(columns[layout.reward])
+    rows = len(columns[layout.numbers[0]])
     if not rows:
         raise _checks.InvalidValueError("log", numbers.source, "a log with at least one row")
     found = {name: numbers.of(columns[name], name) for name in layout.numbers}
@@ -36,7 +35,7 @@ def wide_log(columns: dict[str, Any], layout: Layout, numbers: Numbers) -> Ratin
     columns_of |= {name: name for name in layout.names} | ({"by": layout.by} if layout.by else {})
     names: dict[str, Any] = {n: np.array([str(x) for x in columns[c]], dtype=object) for n, c in columns_of.items()}
     return RatingLog(
-        reward=found[layout.reward],
+        reward=None if layout.reward is None else found[layout.reward],
         ratings=ratings,
         raters=layout.ratings,
         **{name: found[name] for name in layout.others},
