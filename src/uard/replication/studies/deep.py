@@ -8,7 +8,7 @@ from uard.agents.value import DeepQ
 from uard.envs.grids.trapgrid import TrapGrid, paper_grid
 from uard.lab.cell import Cell
 from uard.lab.registry import deep_agents
-from uard.lab.studies.common import PANELS, RAW
+from uard.lab.studies.common import PANELS, RAW, SIMPLE
 from uard.lab.study import Row, Study, row
 from uard.method.mitigations import Mitigation, named
 from uard.ratings.panels import as_panel
@@ -17,14 +17,21 @@ from uard.training.feedback.rating_model import RatingModel
 
 AGENTS = deep_agents()
 ENSEMBLE = AGENTS["ensemble-dqn"]
-LEARNED = RatingModel(predicts="ratings")  # as published: what all raters say together
+EARLIER, OURS = "uard-0.1", "uard"
+# The rule of 0.1 was published with a model of what all raters say together; now each rater has a model of her own.
+LEARNED = {EARLIER: RatingModel(predicts="ratings"), OURS: RatingModel()}
 CURVES = ("observed_return", "hacks", "success")
 
 
-def cell(environment: object, mitigation: Mitigation, agent: object, **more: object) -> Cell:
-    """Build a cell whose agent learns what raters would say."""
-    rating_model = None if isinstance(agent, QLearning) else LEARNED
+def cell(environment: object, mitigation: Mitigation, agent: object, model: str = EARLIER, **more: object) -> Cell:
+    """Build a cell whose agent learns what raters would say, by the model of ``uard`` or of its earlier version."""
+    rating_model = None if isinstance(agent, QLearning) else LEARNED[model]
     return Cell(environment, mitigation, agent, **({"rating_model": rating_model} | more))  # type: ignore[arg-type]
+
+
+def ours(environment: object, name: str, agent: object, **more: object) -> Cell:
+    """Build a cell of ``uard`` or ``uard-0.1``, each with its own model."""
+    return cell(environment, named(name), agent, OURS if name == OURS else EARLIER, **more)
 
 
 def baselines() -> tuple[Row, ...]:
@@ -35,11 +42,10 @@ def baselines() -> tuple[Row, ...]:
         for name, agent in AGENTS.items():
             if t == 100 or name != "cpo-oracle":
                 rows.append(row(cell(grid, RAW, agent), agent=name, mitigation="raw", horizon=t))
-        for mitigation in ("uard-paper", "uard-0.1") if t == 100 else ("uard-0.1",):
-            rows.append(
-                row(cell(grid, named(mitigation), ENSEMBLE), agent="ensemble-dqn", mitigation=mitigation, horizon=t)
-            )
-        rows.append(row(cell(grid, named("uard-0.1"), AGENTS["ppo"]), agent="ppo", mitigation="uard-0.1", horizon=t))
+        for mitigation in ("uard-paper", EARLIER, OURS) if t == 100 else (EARLIER, OURS):
+            rows.append(row(ours(grid, mitigation, ENSEMBLE), agent="ensemble-dqn", mitigation=mitigation, horizon=t))
+        for mitigation in (EARLIER, OURS):
+            rows.append(row(ours(grid, mitigation, AGENTS["ppo"]), agent="ppo", mitigation=mitigation, horizon=t))
     return tuple(rows)
 
 
@@ -53,30 +59,32 @@ EVERYWHERE = ("dqn", "ensemble-dqn", "ppo")
 
 
 def mitigated() -> tuple[Row, ...]:
-    """``uard-0.1`` with one setting, T = 100: three agents with +4 and +8 and both panels, the others with one of each."""
+    """``uard`` and ``uard-0.1``, one setting each, T = 100: three agents with +4 and +8 and both panels, others once."""
     return tuple(
         row(
-            cell(TrapGrid(size=10, trap_reward=trap, horizon=100), named("uard-0.1"), agent, panel=as_panel(panel)),
+            ours(TrapGrid(size=10, trap_reward=trap, horizon=100), mitigation, agent, panel=as_panel(panel)),
             agent=name,
             trap=trap,
             panel=panel,
+            mitigation=mitigation,
         )
         for name, agent in AGENTS.items()
         if name != "cpo-oracle"
         for trap in (4.0, 8.0)
         for panel in PANELS
         if name in EVERYWHERE or (trap, panel) == (8.0, "appendix")
+        for mitigation in (EARLIER, OURS)
     )
 
 
-RIVALS = ("mean-of-annotations", "worst-of-annotations", "lcb", "screening", "uard-0.1")
+RIVALS = (*SIMPLE, "screening", EARLIER, OURS)
 
 
 def rivals() -> tuple[Row, ...]:
-    """The other mitigations in the hands of two deep agents, very noisy raters, T = 80."""
+    """The other mitigations in the hands of two deep agents, very noisy raters, T = 80; one model of raters for all."""
     return tuple(
         row(
-            cell(paper_grid(10), named(mitigation), AGENTS[agent], panel=as_panel(panel), noise=1.2),
+            cell(paper_grid(10), named(mitigation), AGENTS[agent], OURS, panel=as_panel(panel), noise=1.2),
             agent=agent,
             mitigation=mitigation,
             panel=panel,
@@ -119,11 +127,19 @@ def feedback() -> tuple[Row, ...]:
     """Running means or a model of the ratings, when 1 %, 10 % or all steps are rated."""
     return tuple(
         row(
-            cell(paper_grid(10), named("uard-0.1"), ENSEMBLE, rated=rated, rating_model=model),
+            cell(
+                paper_grid(10),
+                named(mitigation),
+                ENSEMBLE,
+                rated=rated,
+                rating_model=LEARNED[mitigation] if source == "model" else None,
+            ),
             source=source,
             rated=rated,
+            mitigation=mitigation,
         )
-        for source, model in (("table", None), ("model", LEARNED))
+        for mitigation in (EARLIER, OURS)
+        for source in ("table", "model")
         for rated in (0.01, 0.1, 1.0)
     )
 
