@@ -1,0 +1,356 @@
+"""The store in one SQLite file (write-ahead log, every commit on the disk before it is acknowledged)."""
+
+from __future__ import annotations
+
+import secrets
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Collection, Generator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, final
+
+from uard import _checks
+from uard.collect.items import Item, item_of
+from uard.collect.store import (
+    LEASE_SECONDS,
+    AnswerStore,
+    ConflictError,
+    Lease,
+    LinkUsedError,
+    RaterState,
+    Request,
+    StoreError,
+    hashed,
+)
+from uard.ratings.table import FIELDS, LONGEST, Answer, Answers
+
+VERSION = 1
+APPLICATION = 0x75617264  # "uard", so that `file` and we know whose database it is
+PATIENCE = 10.0  # seconds to wait for another process that writes
+
+_SCHEMA = f"""
+CREATE TABLE items (seq INTEGER PRIMARY KEY, id TEXT NOT NULL UNIQUE, content TEXT NOT NULL);
+CREATE TABLE raters (seq INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, paused INTEGER NOT NULL DEFAULT 0, link TEXT);
+CREATE TABLE sessions (hash TEXT PRIMARY KEY, rater TEXT NOT NULL REFERENCES raters(name));
+CREATE TABLE answers (seq INTEGER PRIMARY KEY, {", ".join(f'"{name}"' for name in FIELDS)}, UNIQUE (id));
+CREATE UNIQUE INDEX superseded ON answers (supersedes) WHERE supersedes IS NOT NULL;
+CREATE INDEX answered_by ON answers (item, rater);
+CREATE TABLE requests (
+    seq INTEGER PRIMARY KEY, item TEXT NOT NULL REFERENCES items(id), rater TEXT REFERENCES raters(name),
+    kind TEXT NOT NULL, priority REAL NOT NULL, "left" TEXT,
+    lease TEXT UNIQUE, held_by TEXT, held_until REAL, answer TEXT
+);
+CREATE INDEX open_requests ON requests (rater, priority DESC, seq) WHERE answer IS NULL;
+CREATE INDEX held_requests ON requests (held_by) WHERE answer IS NULL;
+CREATE INDEX answered_requests ON requests (answer) WHERE answer IS NOT NULL;
+"""
+
+# What a rater may be shown next, of the requests to one name or to nobody in particular (rater IS ?): open, held by
+# nobody else, not rated by her yet unless that is the point, and not in her hands already by another request. A lease
+# that ends further ahead than any lease can was given by a clock that has jumped back since.
+_NEXT = """
+SELECT seq, item, kind FROM requests AS r
+WHERE answer IS NULL AND rater IS :who
+  AND (held_by IS NULL OR held_until < :now OR held_until > :now + :term)
+  AND (kind = 'repeat' OR NOT EXISTS (
+        SELECT 1 FROM answers AS a WHERE a.item = r.item AND a.rater = :rater
+        AND (a.value IS NOT NULL OR a.choice IS NOT NULL)
+        AND NOT EXISTS (SELECT 1 FROM answers AS b WHERE b.supersedes = a.id)))
+  AND NOT EXISTS (SELECT 1 FROM requests AS h WHERE h.item = r.item AND h.held_by = :rater AND h.answer IS NULL
+        AND h.seq <> r.seq)
+ORDER BY priority DESC, seq
+"""
+
+
+@final
+class SQLiteStore(AnswerStore):
+    """An ``AnswerStore`` in a file.
+
+    Examples:
+        >>> import tempfile
+        >>> from uard.collect.items import text_item
+        >>> with tempfile.TemporaryDirectory() as folder, SQLiteStore(Path(folder) / "answers.sqlite") as store:
+        ...     item = text_item("2 + 2?", "4")
+        ...     _ = store.add_items([item]), store.invite("ann"), store.ask([Request(item.id)])
+        ...     (lease,) = store.lease("ann")
+        ...     _ = store.put([Answer("a1", item.id, "ann", value=1.0)], lease.id)
+        ...     store.answers()[0].rows[0].value, store.lease("ann")
+        (1.0, ())
+
+    Attributes:
+        path: The file.
+    """
+
+    def __init__(self, path: str | Path, *, clock: Callable[[], float] = time.time):
+        """Open a store, and make it if there is none.
+
+        Args:
+            path: A file; its folder must be there.
+            clock: Seconds since 1970.
+
+        Raises:
+            StoreError: it cannot be opened, is no such store, or is of another version.
+        """
+        self.path = Path(path)
+        self._clock = clock
+        self._local = threading.local()
+        self._opened: list[sqlite3.Connection] = []
+        self._lock = threading.Lock()
+        with self._changing() as db:
+            self._prepare(db)
+
+    def __enter__(self) -> SQLiteStore:
+        """Return the store."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+        self.close()
+
+    def close(self) -> None:
+        """Close all connections; a later call opens a new one."""
+        with self._lock:
+            opened, self._opened = self._opened, []
+        for connection in opened:
+            connection.close()
+        self._local = threading.local()
+
+    def _prepare(self, db: sqlite3.Connection) -> None:
+        version, application = (
+            int(db.execute(f"PRAGMA {name}").fetchone()[0]) for name in ("user_version", "application_id")
+        )
+        empty = db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+        if empty:
+            for statement in _SCHEMA.split(";"):
+                db.execute(statement)
+            db.execute(f"PRAGMA user_version = {VERSION}")
+            db.execute(f"PRAGMA application_id = {APPLICATION}")
+        elif application != APPLICATION:
+            raise StoreError(f"{self.path} is a database of something else than answers to uard")
+        elif version != VERSION:
+            age = "an older" if version < VERSION else "a newer"
+            raise StoreError(
+                f"{self.path} is of version {version}, made by {age} uard; this one reads {VERSION}; it was left as it is"
+            )
+
+    def _connection(self) -> sqlite3.Connection:
+        found: sqlite3.Connection | None = getattr(self._local, "connection", None)
+        if found is None:
+            found = sqlite3.connect(self.path, timeout=PATIENCE, isolation_level=None, check_same_thread=False)
+            found.row_factory = sqlite3.Row
+            with self._lock:
+                self._opened.append(found)
+            found.execute("PRAGMA journal_mode = WAL")
+            found.execute("PRAGMA synchronous = FULL")  # what is acknowledged survives the loss of power, too
+            found.execute("PRAGMA foreign_keys = ON")
+            self._local.connection = found
+        return found
+
+    @contextmanager
+    def _reading(self) -> Generator[sqlite3.Connection]:
+        try:
+            yield self._connection()
+        except sqlite3.Error as error:
+            raise StoreError(f"{self.path}: {error}") from error
+
+    @contextmanager
+    def _changing(self) -> Generator[sqlite3.Connection]:
+        """Change all or nothing; other writers wait."""
+        with self._reading() as db:
+            db.execute("BEGIN IMMEDIATE")
+            try:
+                yield db
+                db.execute("COMMIT")
+            except BaseException:
+                if db.in_transaction:  # SQLite itself may have rolled back, on a full disk
+                    db.execute("ROLLBACK")
+                raise
+
+    def add_items(self, items: Sequence[Item]) -> int:
+        """See ``AnswerStore``."""
+        with self._changing() as db:
+            rows = [(item.id, item.as_json) for item in items]
+            return sum(db.execute("INSERT OR IGNORE INTO items (id, content) VALUES (?, ?)", r).rowcount for r in rows)
+
+    def items(self, after: int = 0) -> tuple[tuple[Item, ...], int]:
+        """See ``AnswerStore``."""
+        with self._reading() as db:
+            rows = db.execute("SELECT seq, content FROM items WHERE seq > ? ORDER BY seq", (after,)).fetchall()
+        return tuple(item_of(row["content"]) for row in rows), rows[-1]["seq"] if rows else after
+
+    def invite(self, rater: str) -> str:
+        """See ``AnswerStore``."""
+        _checks.instance("rater", rater, str, "a name")
+        if not rater.strip() or rater != rater.strip() or len(rater) > LONGEST or not rater.isprintable():
+            raise _checks.InvalidValueError(
+                "rater", rater, f"a name of 1 to {LONGEST} printable characters, no spaces around"
+            )
+        secret = secrets.token_urlsafe(16)
+        with self._changing() as db:
+            db.execute(
+                "INSERT INTO raters (name, link) VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET link = excluded.link",
+                (rater, hashed(secret)),
+            )
+        return secret
+
+    def enter(self, secret: str) -> tuple[str, str]:
+        """See ``AnswerStore``."""
+        session = secrets.token_urlsafe(16)
+        with self._changing() as db:
+            row = db.execute("SELECT name FROM raters WHERE link = ?", (hashed(secret),)).fetchone()
+            if row is None:
+                raise LinkUsedError("this link was used before, or was never given out; ask for a new one")
+            db.execute("UPDATE raters SET link = NULL WHERE name = ?", (row["name"],))
+            db.execute("INSERT INTO sessions (hash, rater) VALUES (?, ?)", (hashed(session), row["name"]))
+        return str(row["name"]), session
+
+    def raters(self) -> tuple[RaterState, ...]:
+        """See ``AnswerStore``."""
+        with self._reading() as db:
+            rows = db.execute("SELECT name, paused FROM raters ORDER BY seq").fetchall()
+            held: dict[str, set[str]] = {row["name"]: set() for row in rows}
+            for row in db.execute("SELECT hash, rater FROM sessions"):
+                held.setdefault(row["rater"], set()).add(row["hash"])
+        return tuple(
+            RaterState(row["name"], bool(row["paused"]), bool(held[row["name"]]), frozenset(held[row["name"]]))
+            for row in rows
+        )
+
+    def pause(self, rater: str, paused: bool) -> None:
+        """See ``AnswerStore``."""
+        with self._changing() as db:
+            if not db.execute("UPDATE raters SET paused = ? WHERE name = ?", (int(paused), rater)).rowcount:
+                known = [row["name"] for row in db.execute("SELECT name FROM raters")]
+                raise _checks.UnknownNameError("rater", rater, known)
+
+    def ask(self, requests: Sequence[Request]) -> int:
+        """See ``AnswerStore``."""
+        with self._changing() as db:
+            for r in requests:
+                _expect(db, "items", "id", r.item, "item")
+                if r.rater is not None:
+                    _expect(db, "raters", "name", r.rater, "rater")
+                db.execute(
+                    "INSERT INTO requests (item, rater, kind, priority) VALUES (?, ?, ?, ?)",
+                    (r.item, r.rater, r.kind, float(r.priority)),
+                )
+        return len(requests)
+
+    def lease(self, rater: str, count: int = 1, without: Collection[str] = ()) -> tuple[Lease, ...]:
+        """See ``AnswerStore``."""
+        with self._changing() as db:
+            now = self._clock()
+            held = db.execute(
+                "SELECT seq, item, kind FROM requests WHERE held_by = ? AND answer IS NULL", (rater,)
+            ).fetchall()
+            known = {row["seq"] for row in held}
+            found = [row for row in held if row["item"] not in without]
+            found.sort(key=lambda row: (row["kind"] != "practice", row["seq"]))
+            while len(found) < count:
+                row = self._next(db, rater, now, without)
+                if row is None:
+                    break
+                self._hold(db, row, rater, now)
+                found.append(row)
+            found = found[:count]
+            until = now + LEASE_SECONDS
+            for row in found:
+                if row["seq"] in known:
+                    db.execute("UPDATE requests SET held_until = ? WHERE seq = ?", (until, row["seq"]))
+            return tuple(_lease_of(db, row["seq"], rater) for row in found)
+
+    @staticmethod
+    def _next(db: sqlite3.Connection, rater: str, now: float, without: Collection[str]) -> sqlite3.Row | None:
+        """Return the open request that comes first: those to this rater before those to anybody."""
+        for who in (rater, None):
+            given = {"who": who, "rater": rater, "now": now, "term": LEASE_SECONDS}
+            rows = db.execute(_NEXT, given)
+            for row in rows:
+                if row["item"] not in without:
+                    return row
+        return None
+
+    @staticmethod
+    def _hold(db: sqlite3.Connection, row: sqlite3.Row, rater: str, now: float) -> None:
+        content = item_of(db.execute("SELECT content FROM items WHERE id = ?", (row["item"],)).fetchone()[0]).content
+        left = secrets.choice([content["left"], content["right"]]) if content["kind"] == "pair" else None
+        db.execute(
+            'UPDATE requests SET lease = ?, held_by = ?, held_until = ?, "left" = ? WHERE seq = ?',
+            (secrets.token_hex(16), rater, now + LEASE_SECONDS, left, row["seq"]),
+        )
+
+    def put(self, answers: Sequence[Answer], lease: str | None = None) -> tuple[Answer, ...]:
+        """See ``AnswerStore``."""
+        if not answers:
+            raise _checks.InvalidValueError("answers", answers, "at least one")
+        with self._changing() as db:
+            known = [_stored(db, a.id) for a in answers]
+            if known[0] is not None:
+                for a, there in zip(answers, known, strict=True):
+                    if there is None or _essence(there) != _essence(a):
+                        raise ConflictError(f"another answer is stored as {a.id!r}")
+                return tuple(a for a in known if a is not None)
+            for a in answers:
+                self._add(db, a)
+            if lease is not None:
+                db.execute(
+                    "UPDATE requests SET answer = ? WHERE lease = ? AND answer IS NULL AND item = ?",
+                    (answers[0].id, lease, answers[0].item),
+                )
+        return tuple(answers)
+
+    @staticmethod
+    def _add(db: sqlite3.Connection, answer: Answer) -> None:
+        if _stored(db, answer.id) is not None:
+            raise ConflictError(f"another answer is stored as {answer.id!r}")
+        _expect(db, "items", "id", answer.item, "item")
+        _expect(db, "raters", "name", answer.rater, "rater")
+        if answer.supersedes is not None:
+            before = _stored(db, answer.supersedes)
+            if before is None or (before.rater, before.item) != (answer.rater, answer.item):
+                raise ConflictError(f"{answer.rater} has given no answer {answer.supersedes!r} about this item")
+            if db.execute("SELECT 1 FROM answers WHERE supersedes = ?", (before.id,)).fetchone():
+                raise ConflictError(f"the answer {answer.supersedes!r} was taken back before")
+        marks = ", ".join("?" * len(FIELDS))
+        names = ", ".join(f'"{name}"' for name in FIELDS)
+        db.execute(f"INSERT INTO answers ({names}) VALUES ({marks})", tuple(getattr(answer, name) for name in FIELDS))
+        if answer.said is None and answer.source != "owner":
+            db.execute(
+                "UPDATE requests SET answer = NULL, held_by = ? WHERE answer = ?", (answer.rater, answer.supersedes)
+            )
+
+    def answers(self, after: int = 0) -> tuple[Answers, int]:
+        """See ``AnswerStore``."""
+        with self._reading() as db:
+            rows = db.execute("SELECT * FROM answers WHERE seq > ? ORDER BY seq", (after,)).fetchall()
+        return Answers(tuple(_answer_of(row) for row in rows)), rows[-1]["seq"] if rows else after
+
+
+def _lease_of(db: sqlite3.Connection, seq: int, rater: str) -> Lease:
+    row = db.execute(
+        'SELECT lease, kind, held_until, r."left" AS side, content FROM requests AS r JOIN items ON items.id = r.item '
+        "WHERE r.seq = ?",
+        (seq,),
+    ).fetchone()
+    return Lease(row["lease"], item_of(row["content"]), rater, row["kind"], row["held_until"], row["side"])
+
+
+def _stored(db: sqlite3.Connection, name: str) -> Answer | None:
+    row = db.execute("SELECT * FROM answers WHERE id = ?", (name,)).fetchone()
+    return None if row is None else _answer_of(row)
+
+
+def _answer_of(row: sqlite3.Row) -> Answer:
+    return Answer(**{name: row[name] for name in FIELDS})
+
+
+def _essence(answer: Answer) -> tuple[Any, ...]:
+    """Return what makes it this answer: all but the times, which differ when it is sent again."""
+    return tuple(getattr(answer, name) for name in FIELDS if name not in ("shown_at", "given_at"))
+
+
+def _expect(db: sqlite3.Connection, table: str, column: str, value: str, what: str) -> None:
+    if db.execute(f"SELECT 1 FROM {table} WHERE {column} = ?", (value,)).fetchone() is None:
+        raise ConflictError(f"there is no {what} {value!r} in this store")
