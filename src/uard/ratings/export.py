@@ -1,0 +1,217 @@
+"""Answers in the files of other tools: long tables, TRL's preference rows, Label Studio's JSON, and the whole record."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+from uard import _checks
+from uard.ratings.table import FIELDS, Answer, Answers, answer_of
+
+Contents = Mapping[str, Mapping[str, Any]]
+"""Name of an item -> its content (``uard.collect.items``)."""
+Row = dict[str, Any]
+
+
+def write(answers: Answers, items: Contents, form: str) -> bytes:
+    """Return answers as the bytes of a file.
+
+    Forms:
+
+    * ``csv``, ``jsonl``, ``parquet``: a row per answer that stands, practice left out: item, rater, rating or choice,
+      what the environment paid, further attributes as columns. ``uard doctor`` and ``uard preferences`` read them.
+    * ``trl``: a row per comparison that is no tie, as TRL's ``DPOTrainer`` and ``RewardTrainer`` take them (JSONL):
+      prompt, chosen and rejected; for clips the names of the two.
+    * ``label-studio``: a task per item with one annotation per rater, as Label Studio exports and imports it.
+    * ``record``: every answer that was ever given, superseded ones, practice and what was taken back included (JSONL);
+      ``read_record`` reads it.
+
+    Examples:
+        >>> said = Answers((Answer("a1", "x", "ann", 0.5, scale="slider -1..1"),))
+        >>> print(write(said, {"x": {"kind": "text", "reward": 1.0}}, "csv").decode())
+        item,rater,rating,reward,kind,shown_at,given_at,id
+        x,ann,0.5,1.0,rating,1970-01-01T00:00:00+00:00,1970-01-01T00:00:00+00:00,a1
+        <BLANKLINE>
+
+    Args:
+        answers: All of them.
+        items: What was rated; an item that is not there is known by its name only.
+        form: One of ``FORMS``.
+
+    Raises:
+        UnknownNameError: there is no such form.
+        InvalidValueError: Parquet is wanted and pyarrow is not installed, or there are no comparisons for ``trl``.
+    """
+    return _WRITERS[_checks.choose("form", form, FORMS)](answers, items)
+
+
+def read_record(data: bytes) -> Answers:
+    """Return the answers that ``write(..., "record")`` wrote.
+
+    Examples:
+        >>> said = Answers((Answer("a1", "x", "ann", 0.1),))
+        >>> read_record(write(said, {}, "record")) == said
+        True
+
+    Raises:
+        InvalidValueError: a line is none of them.
+    """
+    rows: list[Answer] = []
+    for number, line in enumerate(data.decode().splitlines()):
+        try:
+            rows.append(answer_of(json.loads(line)))
+        except json.JSONDecodeError:
+            raise _checks.InvalidValueError(f"line {number + 1}", line, "an answer as JSON") from None
+    return Answers(tuple(rows))
+
+
+def rows_of(answers: Answers, items: Contents) -> list[Row]:
+    """Return a row per answer that stands, practice left out; columns that are empty everywhere are left out, too.
+
+    Examples:
+        >>> said = Answers((Answer("a1", "x", "ann", choice="left", left="u", right="v"),))
+        >>> rows_of(said, {})[0]["choice"]
+        'left'
+
+    Args:
+        answers: All of them.
+        items: See ``write``.
+    """
+    rows: dict[tuple[str, str, str], Row] = {}  # attributes are given in one go, at one time
+    attributes: list[str] = []
+    for a in answers.standing():
+        if a.kind == "practice":
+            continue
+        content = items.get(a.item, {})
+        place = a.item, a.rater, a.id.partition(".")[0] if a.attribute else a.id
+        row = rows.setdefault(place, _row(a, content))
+        if a.attribute:
+            row[a.attribute] = a.value
+            attributes.append(a.attribute)
+        else:
+            row["rating"], row["choice"], row["comment"], row["id"] = a.value, a.choice, a.comment or None, a.id
+    names = [*_COLUMNS, *(n for n in dict.fromkeys(attributes)), *_AFTER]
+    used = [n for n in names if any(row.get(n) is not None for row in rows.values())]
+    return [{n: row.get(n) for n in used} for row in rows.values()]
+
+
+_COLUMNS = ("item", "rater", "rating", "left", "right", "choice", "reward", "stratum")
+_AFTER = ("comment", "kind", "shown_at", "given_at", "id")
+
+
+def _row(answer: Answer, content: Mapping[str, Any]) -> Row:
+    return {
+        "item": answer.item,
+        "rater": answer.rater,
+        "left": answer.left,
+        "right": answer.right,
+        "reward": content.get("reward"),
+        "stratum": content.get("stratum") or None,
+        "kind": answer.kind,
+        "shown_at": _time(answer.shown_at),
+        "given_at": _time(answer.given_at),
+    }
+
+
+def _time(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).isoformat()
+
+
+def _csv(answers: Answers, items: Contents) -> bytes:
+    rows = rows_of(answers, items)
+    out = io.StringIO(newline="")
+    writer = csv.DictWriter(out, list(rows[0]) if rows else list(_COLUMNS), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows([{name: _harmless(value) for name, value in row.items()} for row in rows])
+    return out.getvalue().encode()
+
+
+def _harmless(value: Any) -> Any:
+    """Return a cell that no spreadsheet runs as a formula: what raters write comes from outside."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
+
+
+def _jsonl(answers: Answers, items: Contents) -> bytes:
+    return _lines(rows_of(answers, items))
+
+
+def _lines(rows: Sequence[Row]) -> bytes:
+    return "".join(json.dumps(row, ensure_ascii=False, allow_nan=False) + "\n" for row in rows).encode()
+
+
+def _parquet(answers: Answers, items: Contents) -> bytes:
+    try:  # pyarrow has no types
+        pa: Any = importlib.import_module("pyarrow")
+        parquet: Any = importlib.import_module("pyarrow.parquet")
+    except ModuleNotFoundError:
+        allowed = "csv or jsonl, or first: pip install 'uard[doctor]' (pyarrow writes Parquet)"
+        raise _checks.InvalidValueError("form", "parquet", allowed) from None
+    out = io.BytesIO()
+    parquet.write_table(pa.Table.from_pylist(rows_of(answers, items)), out)
+    return out.getvalue()
+
+
+def _trl(answers: Answers, items: Contents) -> bytes:
+    rows: list[Row] = []
+    for c in answers.comparisons():
+        if c.tie:
+            continue
+        chosen, rejected = items.get(c.preferred, {}), items.get(c.other, {})
+        row: Row = {"chosen": chosen.get("completion", c.preferred), "rejected": rejected.get("completion", c.other)}
+        if chosen.get("prompt") is not None and chosen.get("prompt") == rejected.get("prompt"):
+            row = {"prompt": chosen["prompt"]} | row
+        rows.append(row | {"rater": c.rater})
+    if not rows:
+        allowed = "a form for ratings (csv, jsonl, parquet): there are no comparisons of which one side was preferred"
+        raise _checks.InvalidValueError("form", "trl", allowed)
+    return _lines(rows)
+
+
+def _label_studio(answers: Answers, items: Contents) -> bytes:
+    tasks: dict[str, Row] = {}
+    for a in answers.standing():
+        if a.kind == "practice":
+            continue
+        data = {"item": a.item} | {k: v for k, v in items.get(a.item, {}).items() if v is not None}
+        task = tasks.setdefault(a.item, {"id": len(tasks) + 1, "data": data, "annotations": []})
+        marks = task["annotations"]
+        group = a.id.partition(".")[0] if a.attribute else a.id
+        mark = next((m for m in marks if m["unique_id"] == group), None)
+        if mark is None:
+            mark = {"id": a.id, "unique_id": group, "completed_by": a.rater, "was_cancelled": a.choice == "skip"}
+            mark |= {"created_at": _time(a.given_at), "lead_time": a.given_at - a.shown_at, "result": []}
+            marks.append(mark)
+        mark["result"] += _results(a)
+    return json.dumps(list(tasks.values()), ensure_ascii=False, indent=1, allow_nan=False).encode()
+
+
+def _results(answer: Answer) -> list[Row]:
+    name = answer.attribute or "rating"
+    if answer.choice == "skip":
+        return []
+    if answer.choice is not None:
+        choices: Row = {"choices": [answer.choice]}
+        return [{"from_name": "choice", "to_name": "item", "type": "choices", "value": choices}]
+    number: Row = {"number": answer.value}
+    return [{"from_name": name, "to_name": "item", "type": "number", "value": number}]
+
+
+def _record(answers: Answers, _: Contents) -> bytes:
+    return _lines([{name: getattr(a, name) for name in FIELDS} for a in answers])
+
+
+_WRITERS: dict[str, Callable[[Answers, Contents], bytes]] = {
+    "csv": _csv,
+    "jsonl": _jsonl,
+    "parquet": _parquet,
+    "trl": _trl,
+    "label-studio": _label_studio,
+    "record": _record,
+}
+FORMS = tuple(_WRITERS)
+"""What ``write`` can write."""
