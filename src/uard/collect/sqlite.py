@@ -52,7 +52,7 @@ CREATE INDEX answered_requests ON requests (answer) WHERE answer IS NOT NULL;
 # that ends further ahead than any lease can was given by a clock that has jumped back since.
 _NEXT = """
 SELECT seq, item, kind FROM requests AS r
-WHERE answer IS NULL AND rater IS :who
+WHERE answer IS NULL AND rater IS :who AND held_by IS NOT :rater
   AND (held_by IS NULL OR held_until < :now OR held_until > :now + :term)
   AND (kind = 'repeat' OR NOT EXISTS (
         SELECT 1 FROM answers AS a WHERE a.item = r.item AND a.rater = :rater

@@ -1,4 +1,4 @@
-"""Answers in the files of other tools: long tables, TRL's preference rows, Label Studio's JSON, and the whole record."""
+"""Answers as files of other tools: long tables, TRL's preference rows, Label Studio's JSON; and the whole record."""
 
 from __future__ import annotations
 
@@ -181,9 +181,9 @@ def _label_studio(answers: Answers, items: Contents) -> bytes:
         task = tasks.setdefault(a.item, {"id": len(tasks) + 1, "data": data, "annotations": []})
         marks = task["annotations"]
         group = a.id.partition(".")[0] if a.attribute else a.id
-        mark = next((m for m in marks if m["unique_id"] == group), None)
-        if mark is None:
-            mark = {"id": a.id, "unique_id": group, "completed_by": a.rater, "was_cancelled": a.choice == "skip"}
+        mark = next((m for m in marks if m["unique_id"] == group), Row())
+        if not mark:
+            mark |= {"id": a.id, "unique_id": group, "completed_by": a.rater, "was_cancelled": a.choice == "skip"}
             mark |= {"created_at": _time(a.given_at), "lead_time": a.given_at - a.shown_at, "result": []}
             marks.append(mark)
         mark["result"] += _results(a)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Shaped
 
 TIES = frozenset(("tie", "tied", "equal", "same", "draw", "both", "neither", "tiebothbad", "bothbad"))
-SKIPS = frozenset(("skip", "skipped", "unsure", "dontknow", "nopreference"))
+SKIPS = frozenset(("skip", "skipped", "unsure", "dontknow", "cannottell", "nopreference"))
 FIRST = frozenset(("left", "a", "1", "first"))
 SECOND = frozenset(("right", "b", "2", "second"))
 

@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from functools import lru_cache
 
 TIMES = (
-    "updatedat", "submittedat", "completedat", "createdat", "timestamp", "datetime", "date", "time",
+    "updatedat", "givenat", "submittedat", "completedat", "createdat", "timestamp", "datetime", "date", "time",
 )  # fmt: skip
 """Columns that say when; the first that is there counts."""
 

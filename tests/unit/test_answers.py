@@ -1,0 +1,151 @@
+"""The long table, and the files that are made of it."""
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+
+from uard._checks import InvalidValueError, UnknownNameError
+from uard.ratings import export, preferences, readers
+from uard.ratings.table import Answer, Answers, answer_of
+
+ITEMS = {
+    "x": {"kind": "text", "prompt": "Say hi", "completion": "hi", "reward": 1.0, "stratum": "old"},
+    "y": {"kind": "text", "prompt": "Say hi", "completion": "=cmd|' /C calc'!A0", "reward": 0.5, "stratum": "new"},
+}
+
+
+def rated(name, item, rater, value, **more):
+    return Answer(name, item, rater, value, scale="slider -1..1", given_at=1e9 + len(name), **more)
+
+
+def pair(name, rater, choice, left="x", right="y"):
+    return Answer(name, "x|y", rater, choice=choice, left=left, right=right, scale="pair")
+
+
+SAID = Answers((
+    rated("a1", "x", "ann", 0.25),
+    rated("a2", "y", "ann", 0.5),
+    rated("a3", "x", "bob", -1.0),
+    rated("a44", "x", "ann", 0.75, kind="repeat"),
+    rated("a5", "y", "bob", 1.0, kind="practice"),
+    rated("a6", "y", "bob", 0.125),
+    Answer("a7", "y", "bob", supersedes="a6"),
+    rated("a8", "x", "bob", -0.5, supersedes="a3"),
+))  # fmt: skip
+
+
+def test_the_answers_that_stand():
+    assert [a.id for a in SAID.standing()] == ["a1", "a2", "a44", "a5", "a8"]
+    assert SAID.raters == ("ann", "bob")
+
+
+def test_a_log_has_the_latest_rating_and_keeps_the_earlier_ones():
+    log = SAID.to_log(lambda item: ITEMS[item]["reward"])
+    assert log.raters == ("ann", "bob")
+    assert log.item.tolist() == ["x", "y"]
+    np.testing.assert_array_equal(log.ratings, [[0.75, -0.5], [0.5, np.nan]])
+    np.testing.assert_array_equal(log.reward, [1.0, 0.5])
+    assert [x.tolist() for x in log.repeats] == [[0], [0], [0.25]]
+    assert SAID.to_log(lambda _: None).reward is None
+    with pytest.raises(InvalidValueError, match="at least one rating"):
+        Answers((SAID.rows[4],)).to_log(lambda _: None)
+
+
+@pytest.mark.parametrize("form", ["csv", "jsonl", "parquet"])
+def test_the_readers_read_what_is_written(form, tmp_path):
+    file = tmp_path / f"answers.{form}"
+    file.write_bytes(export.write(SAID, ITEMS, form))
+    log = readers.read(file)
+    assert log.raters == ("ann", "bob")
+    np.testing.assert_array_equal(log.ratings, [[0.75, -0.5], [0.5, np.nan]])
+    np.testing.assert_array_equal(log.reward, [1.0, 0.5])
+    assert log.repeats is not None
+
+
+@pytest.mark.parametrize("form", ["csv", "jsonl", "parquet"])
+def test_pairs_are_read_as_they_are_written(form, tmp_path):
+    said = Answers((pair("p1", "ann", "left"), pair("p2", "bob", "right", "y", "x"), pair("p3", "cyd", "tie")))
+    said = Answers((*said.rows, pair("p4", "dan", "cannot tell")))
+    file = tmp_path / f"pairs.{form}"
+    file.write_bytes(export.write(said, ITEMS, form))
+    found = preferences.read(file)
+    assert found.outcome.tolist() == [1.0, 1.0, 0.5]
+    assert (found.skipped, found.swapped) == (1, 1)
+
+
+def test_rows_of_preferences_for_trl():
+    said = Answers((pair("p1", "ann", "left"), pair("p2", "bob", "right"), pair("p3", "cyd", "tie")))
+    rows = [json.loads(line) for line in export.write(said, ITEMS, "trl").splitlines()]
+    assert rows[0] == {"prompt": "Say hi", "chosen": "hi", "rejected": ITEMS["y"]["completion"], "rater": "ann"}
+    assert (rows[1]["chosen"], len(rows)) == (ITEMS["y"]["completion"], 2)
+    with pytest.raises(InvalidValueError, match="there are no comparisons"):
+        export.write(SAID, ITEMS, "trl")
+
+
+def test_label_studio_reads_and_we_read_it_back(tmp_path):
+    file = tmp_path / "tasks.json"
+    file.write_bytes(export.write(SAID, ITEMS, "label-studio"))
+    tasks = json.loads(file.read_text())
+    assert [t["data"]["item"] for t in tasks] == ["x", "y"]
+    log = readers.read(file)
+    assert log.raters == ("ann", "bob")
+    np.testing.assert_array_equal(log.ratings, [[0.75, -0.5], [0.5, np.nan]])
+
+
+def test_attributes_are_columns_of_the_same_row():
+    more = Answer("b1.1", "x", "ann", 1.0, attribute="safe", given_at=5.0)
+    said = Answers((Answer("b1", "x", "ann", 0.5, given_at=5.0), more))
+    (row,) = export.rows_of(said, ITEMS)
+    assert (row["rating"], row["safe"]) == (0.5, 1.0)
+    assert said.to_log(lambda _: None, "safe").ratings.tolist() == [[1.0]]
+    (task,) = json.loads(export.write(said, ITEMS, "label-studio"))
+    assert [r["from_name"] for r in task["annotations"][0]["result"]] == ["rating", "safe"]
+
+
+def test_the_record_holds_all_of_it_to_the_bit():
+    data = export.write(SAID, ITEMS, "record")
+    assert export.read_record(data) == SAID
+    assert export.write(export.read_record(data), {}, "record") == data
+    with pytest.raises(InvalidValueError, match="line 1 = 'no'"):
+        export.read_record(b"no\n")
+
+
+def test_no_cell_of_a_csv_file_is_a_formula():
+    said = Answers((rated("c1", "x", "=1+1", 0.5, comment="@SUM(A1)"),))
+    (row,) = csv.DictReader(io.StringIO(export.write(said, ITEMS, "csv").decode()))
+    assert (row["rater"], row["comment"], row["rating"]) == ("'=1+1", "'@SUM(A1)", "0.5")
+
+
+def test_nothing_to_export_is_an_empty_table():
+    assert export.write(Answers(), {}, "csv").count(b"\n") == 1
+    assert export.write(Answers(), {}, "jsonl") == b""
+    with pytest.raises(UnknownNameError, match="did you mean 'parquet'"):
+        export.write(SAID, ITEMS, "parqet")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"id": ""}, "id = ''"),
+        ({"rater": "a\nb"}, "rater"),
+        ({"value": float("nan")}, "value = nan"),
+        ({"value": None}, "value = None"),
+        ({"choice": "left", "value": None}, "left, right"),
+        ({"choice": "best", "value": None}, "choice = 'best'"),
+        ({"choice": "skip"}, "None where there is a choice"),
+        ({"kind": "test"}, "kind = 'test'"),
+        ({"given_at": -1.0}, "given_at"),
+        ({"comment": "x" * 2001}, "comment"),
+    ],
+)
+def test_bad_answers_are_refused_by_name(fields, message):
+    with pytest.raises(InvalidValueError, match=message):
+        Answer(**{"id": "a", "item": "x", "rater": "ann", "value": 1.0} | fields)
+
+
+def test_a_row_without_a_rater_is_no_answer():
+    with pytest.raises(InvalidValueError, match="rater = None"):
+        answer_of({"id": "a", "item": "x", "value": 1})
