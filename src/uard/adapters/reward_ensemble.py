@@ -7,18 +7,17 @@ fixed random function, so that members disagree where nothing was seen [Osband e
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 
 from uard import _checks
+from uard.adapters.features import RandomFeatures
 from uard.method import uncertainty
 
 if TYPE_CHECKING:
     from jaxtyping import Float
-
-BOUND = 10.0  # coordinates without finite bounds are cut off here
 
 
 class RewardEnsemble:
@@ -60,19 +59,12 @@ class RewardEnsemble:
             InvalidValueError: naming the argument, its value and what is allowed; a space of which a sample is no row
                 of numbers (``Sequence``, ``Graph``).
         """
-        for field, space in (("observation_space", observation_space), ("action_space", action_space)):
-            if not space.is_np_flattenable:
-                raise _checks.InvalidValueError(field, space, "one whose samples have a fixed number of numbers")
         _checks.whole("seed", seed)
         _checks.whole("members", members, low=2, high=64)
-        _checks.whole("features", features, low=1, high=4096)
         _checks.number("ridge", ridge, low=0, open_low=True)
         _checks.number("prior_scale", prior_scale, low=0, open_low=True)
-        self._spaces = observation_space, action_space
         self._random = np.random.default_rng(seed)
-        width = sum(gymnasium.spaces.flatdim(space) for space in self._spaces)
-        self._directions = self._random.normal(0.0, 1.0 / np.sqrt(width), (members, width, features))
-        self._phases = self._random.uniform(0.0, 2.0 * np.pi, (members, 1, features))
+        self._features = RandomFeatures(observation_space, action_space, members, features, self._random)
         self._prior = self._random.normal(0.0, prior_scale, (members, features))
         self._gram = np.tile(ridge * np.eye(features), (members, 1, 1))
         self._moment = np.zeros((members, features))
@@ -108,35 +100,3 @@ class RewardEnsemble:
         if self._seen >= self._due:
             self._due = self._seen + min(self._seen, 256)
             self._weights = np.linalg.solve(self._gram, self._moment[..., None])[..., 0]
-
-    def _features(self, observations: Any, actions: Any) -> Float[np.ndarray, "N B F"]:
-        flat = np.concatenate([_flat(s, x) for s, x in zip(self._spaces, (observations, actions), strict=True)], axis=1)
-        _checks.finite("observations and actions", flat)
-        projected = np.einsum("bw,nwf->nbf", flat, self._directions) * np.sqrt(flat.shape[1])
-        return np.cos(projected + self._phases) * np.sqrt(2.0 / self._phases.shape[-1])
-
-
-def _flat(space: gymnasium.Space[Any], batch: Any) -> Float[np.ndarray, "B width"]:
-    """Return a batch as numbers of size about one."""
-    if isinstance(space, gymnasium.spaces.Discrete):
-        numbers = np.asarray(batch).reshape(-1) - int(space.start)
-        if numbers.dtype.kind not in "iu" or numbers.min(initial=0) < 0 or numbers.max(initial=0) >= space.n:
-            raise _checks.InvalidValueError("batch", batch, f"whole numbers of {space}")
-        return np.eye(int(space.n))[numbers]
-    if isinstance(space, gymnasium.spaces.Box):
-        flat = np.asarray(batch, float).reshape(len(batch), -1)
-        box = cast("Any", space)  # the precision of its bounds is not in its type
-        low, high = (np.asarray(bound, float).ravel() for bound in (box.low, box.high))
-        bounded = np.isfinite(low) & np.isfinite(high)
-        middle, half = np.where(bounded, (low + high) / 2, 0.0), np.where(bounded, (high - low) / 2, 1.0)
-        return np.clip((flat - middle) / np.where(half > 0, half, 1.0), -BOUND, BOUND)
-    rows = gymnasium.vector.utils.iterate(gymnasium.vector.utils.batch_space(space, _length(batch)), batch)
-    return np.array([gymnasium.spaces.flatten(space, row) for row in rows], float)
-
-
-def _length(batch: Any) -> int:
-    """Return B of a batch that may be a dictionary or a tuple of batches."""
-    while isinstance(batch, dict | tuple):
-        parts = cast("dict[Any, Any] | tuple[Any, ...]", batch)
-        batch = next(iter(parts.values())) if isinstance(parts, dict) else parts[0]
-    return len(batch)
