@@ -123,7 +123,8 @@ class ClipModel:
         gram = np.einsum("nbf,nbg->nfg", weighted, z) + self._ridge * np.eye(z.shape[-1])
         residual = gap - np.einsum("nbf,nf->nb", z, prior)
         moment: Any = np.einsum("nbf,nb->nf", weighted, residual)
-        return prior + np.linalg.solve(gram, moment[..., None])[..., 0]
+        solved: Any = np.linalg.solve(gram, moment[..., None])
+        return prior + solved[..., 0]
 
     def __call__(self, observations: Any, actions: Any) -> Float[np.ndarray, "B K"]:
         """Return the gaps of steps by rater, in reward units; NaN where too little is known of them.
