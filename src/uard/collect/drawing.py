@@ -30,6 +30,7 @@ def check(env: gymnasium.Env[Any, Any]) -> None:
     """Check that an environment draws pictures.
 
     Examples:
+        >>> import uard.envs
         >>> check(gymnasium.make("uard/TrapGrid6-v0", render_mode="ansi"))
         Traceback (most recent call last):
             ...
@@ -58,6 +59,7 @@ def find_library(env: gymnasium.Env[Any, Any]) -> None:
     To be called before the environment's first ``reset``; others than MuJoCo's are left alone.
 
     Examples:
+        >>> import uard.envs
         >>> find_library(gymnasium.make("uard/TrapGrid6-v0", render_mode="rgb_array"))
 
     Args:
@@ -82,6 +84,7 @@ def simplify(env: gymnasium.Env[Any, Any]) -> None:
     the physics changes. To be called after ``reset`` and before the first picture.
 
     Examples:
+        >>> import uard.envs
         >>> simplify(gymnasium.make("uard/TrapGrid6-v0", render_mode="rgb_array"))
 
     Args:
@@ -105,6 +108,7 @@ def picture(env: gymnasium.Env[Any, Any], before: tuple[int, ...] | None = None)
     """Return a picture of an environment as it is now.
 
     Examples:
+        >>> import uard.envs
         >>> env = gymnasium.make("uard/TrapGrid6-v0", render_mode="rgb_array")
         >>> _ = env.reset(seed=0)
         >>> picture(env).shape
@@ -130,13 +134,14 @@ def picture(env: gymnasium.Env[Any, Any], before: tuple[int, ...] | None = None)
         raise _checks.InvalidValueError("render()", what, "a picture, an array (H, W, 3) of uint8")
     if before is not None and shape != before:
         raise _checks.InvalidValueError("render().shape", shape, f"{before}, as in the pictures before")
-    return cast("np.ndarray", found)
+    return found
 
 
 def speed(env: gymnasium.Env[Any, Any], fps: float | None) -> float:
     """Return how many frames a second show an environment in its own time, at most 30; ``fps`` if that is given.
 
     Examples:
+        >>> import uard.envs
         >>> speed(gymnasium.make("uard/TrapGrid6-v0"), None)
         8.0
     """
