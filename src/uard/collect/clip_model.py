@@ -122,9 +122,9 @@ class ClipModel:
         weighted = times[..., None] * z
         gram = np.einsum("nbf,nbg->nfg", weighted, z) + self._ridge * np.eye(z.shape[-1])
         residual = gap - np.einsum("nbf,nf->nb", z, prior)
-        moment: Any = np.einsum("nbf,nb->nf", weighted, residual)
-        solved: Any = np.linalg.solve(gram, moment[..., None])
-        return prior + solved[..., 0]
+        moment = np.einsum("nbf,nb->nf", weighted, residual)
+        solve: Any = np.linalg.solve  # whose types are not all known
+        return prior + solve(gram, moment[..., None])[..., 0]
 
     def __call__(self, observations: Any, actions: Any) -> Float[np.ndarray, "B K"]:
         """Return the gaps of steps by rater, in reward units; NaN where too little is known of them.

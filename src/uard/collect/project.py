@@ -1,4 +1,4 @@
-"""A project is a folder: the question (``project.toml``), the answers (``answers.sqlite``) and the clips (``media``)."""
+"""A project is a folder: its question (``project.toml``), its answers (``answers.sqlite``), its clips (``media``)."""
 
 from __future__ import annotations
 

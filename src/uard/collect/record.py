@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ _LEAST_GAP = 8  # steps between two clips of one episode are drawn below this, o
 
 
 @dataclass(frozen=True, eq=False)
-class _Clip:
+class Clip:
     """A piece of an episode.
 
     Attributes:
@@ -50,6 +50,22 @@ class _Clip:
     actions: Shaped[np.ndarray, "n ..."]
     rewards: Shaped[np.ndarray, " n"]
     key: list[int] | None
+
+    @staticmethod
+    def of(
+        frames: Sequence[np.ndarray],
+        observations: Sequence[np.ndarray],
+        actions: Sequence[np.ndarray],
+        rewards: Sequence[float],
+        key: list[int] | None,
+    ) -> Clip:
+        """Return a piece of an episode from its steps.
+
+        Raises:
+            InvalidValueError: observations or actions have different shapes.
+        """
+        seen, done = _stacked("observation", observations), _stacked("action", actions)
+        return Clip(np.stack(frames), seen, done, np.array(rewards), key)
 
     def mark(self) -> bytes:
         """Return what only clips of the same content share."""
@@ -123,7 +139,7 @@ def record(
     with ThreadPoolExecutor(1) as pool:  # compressing a picture takes as long as drawing it, and holds no lock
         waiting: list[Any] = []
         for clip in _different(recorder.clips(seed), segments):
-            waiting.append(pool.submit(_kept, clip, project, rate, stratum))
+            waiting.append(pool.submit(keep_clip, clip, project, rate, stratum))
             if len(waiting) > _WAITING:
                 items.append(waiting.pop(0).result())
             if progress is not None:
@@ -142,7 +158,7 @@ def _policy(policy: Policy | str, env: gymnasium.Env[Any, Any], seed: int) -> Po
     return lambda observation: env.action_space.sample()
 
 
-def _different(clips: Iterator[_Clip], count: int) -> Iterator[_Clip]:
+def _different(clips: Iterator[Clip], count: int) -> Iterator[Clip]:
     """Yield clips of different content; fewer than asked for, if there seem to be no more."""
     seen: set[bytes] = set()
     vain = 0
@@ -156,7 +172,8 @@ def _different(clips: Iterator[_Clip], count: int) -> Iterator[_Clip]:
             return
 
 
-def _kept(clip: _Clip, project: Project, fps: float, stratum: str) -> Item:
+def keep_clip(clip: Clip, project: Project, fps: float, stratum: str) -> Item:
+    """Keep a clip's files in a project, and return its item, which is not in the store yet."""
     sheet = sheets.sheet_of(clip.frames)
     file = io.BytesIO()
     np.savez_compressed(file, observations=clip.observations, actions=clip.actions, rewards=clip.rewards)
@@ -189,12 +206,12 @@ class _Recorder:
         self._steps = 0  # of this episode
         self._over = True
 
-    def clips(self, seed: int) -> Iterator[_Clip]:
+    def clips(self, seed: int) -> Iterator[Clip]:
         """Yield clips without end."""
         self._observation, _ = self._env.reset(seed=seed)
         drawing.simplify(self._env)
         self._frame()  # what cannot be drawn, or not as arrays, is known now
-        self._array("observation_space", self._observation)
+        as_array(self._env, "observation_space", self._observation)
         self._over = False
         self._pass(self._reach)  # only to know how long it lasts
         lasted = min(self._steps, self._reach)
@@ -233,37 +250,45 @@ class _Recorder:
         self._shape = found.shape
         return sheets.fitted(found)
 
-    def _clip(self) -> _Clip:
-        frames, observations = [self._frame()], [self._array("observation_space", self._observation)]
+    def _clip(self) -> Clip:
+        frames, observations = [self._frame()], [as_array(self._env, "observation_space", self._observation)]
         actions: list[np.ndarray] = []
         rewards: list[float] = []
         while not self._over and len(actions) < self._length:
             action, reward = self._step()
-            actions.append(self._array("action_space", action))
+            actions.append(as_array(self._env, "action_space", action))
             rewards.append(reward)
             frames.append(self._frame())
-            observations.append(self._array("observation_space", self._observation))
+            observations.append(as_array(self._env, "observation_space", self._observation))
         key = [int(observations[0]), int(actions[0])] if self._numbered else None
-        return _Clip(
-            np.stack(frames), _stacked("observation", observations), _stacked("action", actions), np.array(rewards), key
-        )
-
-    def _array(self, field: str, value: Any) -> np.ndarray:
-        """Return an observation or an action as an array; dictionaries and tuples are made flat."""
-        space: Any = getattr(self._env, field)
-        spaces = gymnasium.spaces
-        if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
-            found = np.asarray(value)
-        elif space.is_np_flattenable:
-            found = np.asarray(cast("Any", gymnasium.spaces.flatten(space, value)))
-        else:
-            raise _checks.InvalidValueError(field, space, "a space of arrays, or of such as can be flattened to one")
-        if found.dtype.kind not in "biuf":
-            raise _checks.InvalidValueError(field, cast("object", value), f"of numbers, as {space} says")
-        return found
+        return Clip.of(frames, observations, actions, rewards, key)
 
 
-def _stacked(field: str, arrays: list[np.ndarray]) -> np.ndarray:
+def as_array(env: gymnasium.Env[Any, Any], field: str, value: Any) -> np.ndarray:
+    """Return an observation or an action as an array; dictionaries and tuples are made flat.
+
+    Args:
+        env: Whose it is.
+        field: ``observation_space`` or ``action_space``.
+        value: The observation or the action.
+
+    Raises:
+        InvalidValueError: it is no array of numbers and cannot be made one.
+    """
+    space: Any = getattr(env, field)
+    spaces = gymnasium.spaces
+    if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+        found = np.asarray(value)
+    elif space.is_np_flattenable:
+        found = np.asarray(cast("Any", gymnasium.spaces.flatten(space, value)))
+    else:
+        raise _checks.InvalidValueError(field, space, "a space of arrays, or of such as can be flattened to one")
+    if found.dtype.kind not in "biuf":
+        raise _checks.InvalidValueError(field, cast("object", value), f"of numbers, as {space} says")
+    return found
+
+
+def _stacked(field: str, arrays: Sequence[np.ndarray]) -> np.ndarray:
     shapes = {array.shape for array in arrays}
     if len(shapes) > 1:
         raise _checks.InvalidValueError(f"{field}.shape", sorted(shapes), "the same in all steps")

@@ -132,7 +132,7 @@ class SQLiteStore(AnswerStore):
         elif version != VERSION:
             age = "an older" if version < VERSION else "a newer"
             raise StoreError(
-                f"{self.path} is of version {version}, made by {age} uard; this one reads {VERSION}; it was left as it is"
+                f"{self.path} is of version {version}, made by {age} uard; this one reads {VERSION}; it was not changed"
             )
 
     def _connection(self) -> sqlite3.Connection:
@@ -225,9 +225,11 @@ class SQLiteStore(AnswerStore):
                 known = [row["name"] for row in db.execute("SELECT name FROM raters")]
                 raise _checks.UnknownNameError("rater", rater, known)
 
-    def ask(self, requests: Sequence[Request]) -> int:
+    def ask(self, requests: Sequence[Request], after: int | None = None) -> int:
         """See ``AnswerStore``."""
         with self._changing() as db:
+            if after is not None and _last_request(db) != after:
+                return 0
             for r in requests:
                 _expect(db, "items", "id", r.item, "item")
                 if r.rater is not None:
@@ -237,6 +239,16 @@ class SQLiteStore(AnswerStore):
                     (r.item, r.rater, r.kind, float(r.priority)),
                 )
         return len(requests)
+
+    def open_requests(self) -> tuple[tuple[Request, ...], int]:
+        """See ``AnswerStore``."""
+        with self._reading() as db:
+            place = _last_request(db)  # first: one that comes between the two is then not thought to have been read
+            rows = db.execute(
+                "SELECT item, rater, kind, priority FROM requests WHERE answer IS NULL AND seq <= ? ORDER BY seq",
+                (place,),
+            ).fetchall()
+        return tuple(Request(row["item"], row["rater"], row["kind"], row["priority"]) for row in rows), place
 
     def lease(self, rater: str, count: int = 1, without: Collection[str] = ()) -> tuple[Lease, ...]:
         """See ``AnswerStore``."""
@@ -326,6 +338,10 @@ class SQLiteStore(AnswerStore):
         with self._reading() as db:
             rows = db.execute("SELECT * FROM answers WHERE seq > ? ORDER BY seq", (after,)).fetchall()
         return Answers(tuple(_answer_of(row) for row in rows)), rows[-1]["seq"] if rows else after
+
+
+def _last_request(db: sqlite3.Connection) -> int:
+    return int(db.execute("SELECT coalesce(max(seq), 0) FROM requests").fetchone()[0])
 
 
 def _lease_of(db: sqlite3.Connection, seq: int, rater: str) -> Lease:

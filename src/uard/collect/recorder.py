@@ -1,0 +1,163 @@
+"""Clips of a training run, while it trains, for people to rate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from uard import _checks
+from uard.adapters.steps import natural_key
+from uard.collect import drawing, sheets
+from uard.collect.items import Item
+from uard.collect.project import Project
+from uard.collect.record import LONGEST, Clip, as_array, keep_clip
+
+EACH = 16  # clips that are put into the store in one go
+
+
+class ClipRecorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+    """Puts pieces of what an agent does into a project; rewards, observations and actions pass unchanged.
+
+    It goes innermost, around the environment that draws, so that no reset comes between a step and its picture. Who is
+    asked about which clip is decided where the page is served (``Question.acquisition``).
+
+    Examples:
+        >>> import tempfile, uard.envs
+        >>> folder = tempfile.TemporaryDirectory()
+        >>> project = Project.create(folder.name)
+        >>> env = gymnasium.make("uard/TrapGrid6-v0", render_mode="rgb_array")
+        >>> env = ClipRecorder(env, project, share=1.0)
+        >>> _ = env.reset(seed=0)
+        >>> for action in (1, 1, 3):
+        ...     _ = env.step(action)
+        >>> env.close()
+        >>> [item.content["key"] for item in project.store().items()[0]]
+        [[0, 1], [6, 1], [12, 3]]
+        >>> folder.cleanup()
+
+    Attributes:
+        recorded: Clips that are new to this run so far.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        project: Project | str | Path,
+        *,
+        share: float = 0.05,
+        length: int = 1,
+        most: int = 100_000,
+        stratum: str = "training",
+        seed: int = 0,
+    ):
+        """Wrap an environment.
+
+        Args:
+            env: Made with ``render_mode="rgb_array"``.
+            project: Where the clips go; its folder if it is text.
+            share: Of the steps that are recorded, in (0, 1].
+            length: Steps of a clip, in [1, 1023]; a clip that an episode's end cuts short is shorter. With one, in a
+                world of numbered states and actions, each state-action is recorded once.
+            most: Clips after which none is recorded any more.
+            stratum: What the clips are called by.
+            seed: Of which steps are recorded, >= 0.
+
+        Raises:
+            InvalidValueError: the environment draws no pictures, there is no such project, or an argument is not what
+                it must be.
+            StoreError: the project's store cannot be opened.
+        """
+        _checks.number("share", share, low=0, high=1, open_low=True)
+        _checks.whole("length", length, low=1, high=LONGEST)
+        _checks.whole("most", most, low=1)
+        _checks.whole("seed", seed)
+        drawing.check(env)
+        gymnasium.utils.RecordConstructorArgs.__init__(
+            self, project=project, share=share, length=length, most=most, stratum=stratum, seed=seed
+        )
+        super().__init__(env)
+        self._project = project if isinstance(project, Project) else Project.open(project)
+        self._store = self._project.store()
+        self._length, self._most, self._stratum = length, most, stratum
+        self._chance = share / length  # that a clip begins at a step
+        self._random = np.random.default_rng(seed)
+        self._numbered = length == 1 and natural_key(env.observation_space, env.action_space) is not None
+        self._rate = drawing.speed(env, None)
+        self._seen: set[Any] = set()
+        self._waiting: list[Item] = []
+        self._clip: _Clip | None = None
+        self._observation: Any = None
+        self._simple = False
+        self.recorded = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; a clip that was not finished ends where the episode was left."""
+        self._finish()
+        self._observation, info = super().reset(seed=seed, options=options)
+        if not self._simple:
+            drawing.find_library(self.env)
+            drawing.simplify(self.env)
+            self._simple = True
+        return self._observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Act, and record the step if it is one of those."""
+        if self._clip is None and self.recorded < self._most and self._random.random() < self._chance:
+            self._begin(action)
+        observation, reward, terminated, truncated, info = super().step(action)
+        if self._clip is not None:
+            self._clip.actions.append(as_array(self.env, "action_space", action))
+            self._clip.rewards.append(float(reward))
+            self._clip.frames.append(self._frame())
+            self._clip.observations.append(as_array(self.env, "observation_space", observation))
+            if len(self._clip.actions) == self._length or terminated or truncated:
+                self._finish()
+        self._observation = observation
+        return observation, reward, terminated, truncated, info
+
+    def close(self) -> None:
+        """Put what waits into the store, and close both."""
+        self._finish()
+        self._flush()
+        self._store.close()
+        super().close()
+
+    def _begin(self, action: Any) -> None:
+        key = None
+        if self._numbered:
+            key = (int(self._observation), int(action))
+            if key in self._seen:
+                return
+            self._seen.add(key)
+        self._clip = _Clip(self._frame(), as_array(self.env, "observation_space", self._observation), key)
+
+    def _frame(self) -> np.ndarray:
+        return sheets.fitted(drawing.picture(self.env))
+
+    def _finish(self) -> None:
+        clip, self._clip = self._clip, None
+        if clip is None or not clip.actions:
+            return
+        made = Clip.of(clip.frames, clip.observations, clip.actions, clip.rewards, clip.key)
+        self._waiting.append(keep_clip(made, self._project, self._rate, self._stratum))
+        self.recorded += 1
+        if len(self._waiting) >= EACH or self.recorded <= EACH:  # the first at once: somebody waits at the page
+            self._flush()
+
+    def _flush(self) -> None:
+        if self._waiting:
+            self._store.add_items(self._waiting)
+            self._waiting = []
+
+
+class _Clip:
+    """A clip that is being recorded."""
+
+    def __init__(self, frame: np.ndarray, observation: np.ndarray, key: tuple[int, int] | None):
+        self.frames, self.observations = [frame], [observation]
+        self.actions: list[np.ndarray] = []
+        self.rewards: list[float] = []
+        self.key = None if key is None else list(key)
