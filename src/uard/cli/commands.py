@@ -24,6 +24,7 @@ OWN = {
     "raters": "raters.Raters",
     "judges": "judges.Judges",
     "best-of-n": "best_of_n.BestOfN",
+    "acquisition": "acquisition.AcquisitionStudy",
     "leaderboard": "leaderboard.Leaderboard",
     "status": "status.Status",
     "compare": "compare.Compare",

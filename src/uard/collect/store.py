@@ -1,4 +1,4 @@
-"""Where items, raters, requests and answers are kept: ten methods, so that another database can follow.
+"""Where items, raters, requests and answers are kept: a few methods, so that another database can follow.
 
 Answers are only ever added. What ``put`` has returned is kept, whatever happens to the process afterwards; what is put
 twice under one name is there once. ``uard.collect.sqlite.SQLiteStore`` is the one that comes with the package.
@@ -150,11 +150,23 @@ class AnswerStore(ABC):
         """
 
     @abstractmethod
-    def ask(self, requests: Sequence[Request]) -> int:
+    def ask(self, requests: Sequence[Request], after: int | None = None) -> int:
         """Add requests, and return how many; the latest come last among those of equal priority.
+
+        Args:
+            requests: What should be rated, and by whom.
+            after: The place up to which ``open_requests`` was read. If somebody has asked since, nothing is added and
+                0 is returned: what should be asked may have changed. Not looked at if left out.
 
         Raises:
             ConflictError: one names an item or a rater that is not there.
+        """
+
+    @abstractmethod
+    def open_requests(self) -> tuple[tuple[Request, ...], int]:
+        """Return the requests that are not answered, in the order in which they were made, and a place.
+
+        The place is that of the last request of all, whether it is open or not.
         """
 
     @abstractmethod

@@ -19,7 +19,19 @@ from uard._support import files
 from uard.lab import studies
 from uard.lab.execution.store import Store
 from uard.lab.result import WINDOW
-from uard.lab.views import best_of_n, figures, games, grids, grpo, leaderboard, panels, published, robots, sections
+from uard.lab.views import (
+    acquisition,
+    best_of_n,
+    figures,
+    games,
+    grids,
+    grpo,
+    leaderboard,
+    panels,
+    published,
+    robots,
+    sections,
+)
 from uard.lab.views.sections import Section
 from uard.lab.views.study_results import StudyResults
 from uard.lab.views.tables import study_table
@@ -55,6 +67,7 @@ def write(
         *robots.section(robots.published()),
         _games(),
         _best_of_n(),
+        *_acquisition(),
         *grpo.section(grpo.published()),
         _made(store, len(results.seeds)),
     ]
@@ -145,6 +158,21 @@ def _best_of_n() -> Section:
     )
     losses = tuple(best_of_n.losses(data))
     return Section("best-of-n", "Best-of-n over-optimisation", 90, html, "Best-of-n", losses=losses)
+
+
+def _acquisition() -> list[Section]:
+    data = published.packaged_json("acquisition.json")
+    if data is None:
+        return []
+    note = "Mean over seeds; the band is the interval of asking at random."
+    html = render(
+        HERE,
+        "acquisition.html.j2",
+        figure=picture("Regret against answers, by rule", note, figures.data_uri(acquisition.figure(data))),
+        table=acquisition.table(data),
+        budgets=acquisition.budgets(data),
+    )
+    return [Section("acquisition", "Who is asked what", 92, html, losses=tuple(acquisition.losses(data)))]
 
 
 def _made(store: Store, seeds: int) -> Section:
