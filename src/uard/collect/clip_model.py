@@ -72,8 +72,8 @@ class ClipModel:
             members: Fits per rater, in [2, 64].
             features: Random features of each member, in [1, 4096].
             ridge: Penalty > 0, in clips: how many it takes before data outweigh the prior.
-            doubt: Where the members' deviation exceeds this share of the deviation of the rater's gaps, nothing is
-                said for her, in (0, 1].
+            doubt: Where the members' deviation exceeds this share of the usual gap (root mean square over clips and
+                raters), nothing is said for a rater, in (0, 1].
             seed: Of features, priors and bootstraps, >= 0.
 
         Raises:
@@ -88,7 +88,7 @@ class ClipModel:
         self._prior = self._random.normal(0.0, 1.0, (members, features))
         self._ridge, self._doubt = ridge, doubt
         self._weights: list[Float[np.ndarray, "N F"] | None] = []
-        self._spread: list[float] = []
+        self._usual = 0.0  # gap
 
     def fit(self, clips: Sequence[RatedClip]) -> None:
         """Fit all raters anew to all clips that are rated.
@@ -106,18 +106,15 @@ class ClipModel:
         if not clips:
             return
         z = np.stack([self._features(c.observations, c.actions).mean(1) for c in clips], axis=1)
-        self._weights, self._spread = [], []
+        self._usual, self._weights = float(np.sqrt(np.nanmean(gaps**2))), []
         for k in range(raters):
             heard = np.isfinite(gaps[:, k])
             enough = int(heard.sum()) >= FEWEST
-            self._spread.append(float(np.std(gaps[heard, k])) if enough else 0.0)
-            self._weights.append(self._regressed(z[:, heard], gaps[heard, k], self._spread[k]) if enough else None)
+            self._weights.append(self._regressed(z[:, heard], gaps[heard, k]) if enough else None)
 
-    def _regressed(
-        self, z: Float[np.ndarray, "N n F"], gap: Float[np.ndarray, " n"], spread: float
-    ) -> Float[np.ndarray, "N F"]:
+    def _regressed(self, z: Float[np.ndarray, "N n F"], gap: Float[np.ndarray, " n"]) -> Float[np.ndarray, "N F"]:
         """Return each member's weights, its fixed random function included."""
-        prior = max(spread, 1e-9) * self._prior
+        prior = self._usual * self._prior
         times = self._random.poisson(1.0, z.shape[:2]).astype(float)  # of each clip in each member's bootstrap
         weighted = times[..., None] * z
         gram = np.einsum("nbf,nbg->nfg", weighted, z) + self._ridge * np.eye(z.shape[-1])
@@ -138,6 +135,6 @@ class ClipModel:
             if weights is None:
                 continue
             said = np.einsum("nbf,nf->nb", z, weights)
-            sure = said.std(0) <= self._doubt * self._spread[k] + 1e-12
+            sure = said.std(0) <= self._doubt * self._usual
             out[:, k] = np.where(sure, said.mean(0), np.nan)
         return out

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Generator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, final
 
@@ -100,6 +101,10 @@ class SQLiteStore(AnswerStore):
         self._lock = threading.Lock()
         with self._changing() as db:
             self._prepare(db)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies and other processes open the file themselves."""
+        return partial(SQLiteStore, clock=self._clock), (self.path,)
 
     def __enter__(self) -> SQLiteStore:
         """Return the store."""

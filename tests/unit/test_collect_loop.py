@@ -1,0 +1,191 @@
+"""What a training run and its raters give each other."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+import uard.envs  # noqa: F401 - registers the environments
+from uard._checks import InvalidValueError
+from uard.adapters.gymnasium import ReliabilityWrapper
+from uard.collect import Project, clip_item
+from uard.collect.clip_model import FEWEST, ClipModel, RatedClip
+from uard.collect.loop import StoreRatings
+from uard.collect.recorder import ClipRecorder
+from uard.ratings.table import Answer
+
+NUMBERED = gymnasium.spaces.Discrete(9), gymnasium.spaces.Discrete(4)
+SMOOTH = gymnasium.spaces.Box(-1.0, 1.0, (2,)), gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+
+@pytest.fixture
+def project(tmp_path):
+    return Project.create(tmp_path / "project")
+
+
+def step(state, action):
+    return clip_item("0" * 64 + ".webp", 2, 2, (8, 8), reward=1.0, key=[state, action])
+
+
+def ask(ratings, state, action):
+    return ratings(np.array([state]), np.array([action]), np.array([0]), np.array([1.0]))[0].tolist()
+
+
+def test_a_rating_is_handed_on_once_when_its_state_comes_again(project):
+    x = step(1, 3)
+    ratings = StoreRatings(project, *NUMBERED, poll=0.0)
+    assert np.isnan(ask(ratings, 1, 3)).all()
+    with project.store() as store:
+        store.add_items([x])
+        store.invite("ann")
+        store.put([Answer("a1", x.id, "ann", -1.0)])
+        store.put([Answer("a2", x.id, "ann", -0.5)])
+        assert np.isnan(ask(ratings, 1, 2)).all()
+        assert ask(ratings, 1, 3) == [-1.0]
+        assert ask(ratings, 1, 3) == [-0.5]
+        assert np.isnan(ask(ratings, 1, 3)).all()
+        store.invite("bob")
+        store.put([Answer("b1", x.id, "bob", 0.25)])
+        np.testing.assert_array_equal(ask(ratings, 1, 3), [np.nan, 0.25])
+    assert (ratings.heard, ratings.raters) == (3, ("ann", "bob"))
+
+
+def test_practice_choices_and_what_is_taken_back_are_no_ratings(project):
+    x = step(1, 3)
+    ratings = StoreRatings(project, *NUMBERED, poll=0.0)
+    with project.store() as store:
+        store.add_items([x])
+        store.invite("ann")
+        store.put([Answer("a1", x.id, "ann", -1.0, kind="practice")])
+        store.put([Answer("a2", x.id, "ann", choice="skip")])
+        store.put([Answer("a3", x.id, "ann", 5.0)])
+        store.put([Answer("a4", x.id, "ann", supersedes="a3")])
+        store.put([Answer("a5", x.id, "ann", 0.5, attribute="safe")])
+    assert np.isnan(ask(ratings, 1, 3)).all()
+    assert ratings.heard == 0
+
+
+def test_the_store_is_looked_into_no_more_often_than_asked(project):
+    now = [0.0]
+    x = step(1, 3)
+    ratings = StoreRatings(project, *NUMBERED, poll=1.0, clock=lambda: now[0])
+    ask(ratings, 0, 0)
+    with project.store() as store:
+        store.add_items([x])
+        store.invite("ann")
+        store.put([Answer("a1", x.id, "ann", -1.0)])
+    assert np.isnan(ask(ratings, 1, 3)).all()
+    now[0] = 1.0
+    assert ask(ratings, 1, 3) == [-1.0]
+
+
+def lying(random, count, length=8):
+    """Clips in whose right half the reward is 1 too high; ann says so, bob repeats the reward, cyd is noisy."""
+    clips = []
+    for _ in range(count):
+        x = random.uniform(-1.0, 0.0, (length, 2)) + random.integers(2)
+        lie = (x[:, 0] > 0).mean()
+        said = np.array([1.0 - lie, 1.0, 1.0 - lie + random.normal(0.0, 0.3)])
+        clips.append(RatedClip(x, np.zeros((length, 1)), 1.0, said))
+    return clips
+
+
+def test_clips_say_of_steps_what_raters_mean():
+    random = np.random.default_rng(0)
+    model = ClipModel(*SMOOTH)
+    model.fit(lying(random, 200))
+    x = random.uniform(-0.9, 0.9, (400, 2))
+    x = x[np.abs(x[:, 0]) > 0.3]
+    gaps = model(x, np.zeros((len(x), 1)))
+    assert np.isfinite(gaps).mean() > 0.9
+    lies = x[:, 0] > 0
+    for k in (0, 2):
+        known = np.isfinite(gaps[:, k])
+        assert ((gaps[known, k] < -0.5) == lies[known]).mean() > 0.85
+    assert np.nanmean(np.abs(gaps[:, 1])) < 0.1
+
+
+def test_nothing_is_said_of_what_is_far_from_every_clip():
+    space = gymnasium.spaces.Box(-10.0, 10.0, (2,)), SMOOTH[1]
+    model = ClipModel(*space)
+    model.fit([c._replace(observations=c.observations) for c in lying(np.random.default_rng(0), 60)])
+    near = model(np.full((50, 2), 0.5) + np.random.default_rng(1).normal(0, 0.05, (50, 2)), np.zeros((50, 1)))
+    far = model(np.random.default_rng(1).uniform(-10, -6, (50, 2)) * [1, -1], np.ones((50, 1)))
+    assert np.isfinite(near[:, 0]).mean() > np.isfinite(far[:, 0]).mean() + 0.3
+
+
+def test_a_rater_is_heard_after_some_clips_only():
+    model = ClipModel(*SMOOTH)
+    assert model(np.zeros((3, 2)), np.zeros((3, 1))).shape == (3, 0)
+    model.fit([])
+    clips = lying(np.random.default_rng(0), FEWEST)
+    model.fit([c._replace(ratings=np.array([c.ratings[0], np.nan])) for c in clips])
+    gaps = model(np.zeros((3, 2)), np.zeros((3, 1)))
+    assert gaps.shape == (3, 2)
+    assert np.isnan(gaps[:, 1]).all()
+
+
+def test_a_run_records_each_numbered_step_once(project):
+    env = gymnasium.make("uard/TrapGrid6-v0", render_mode="rgb_array")
+    env = ClipRecorder(env, project, share=1.0)
+    for seed in (0, 1):
+        env.reset(seed=seed)
+        for action in (1, 1, 3, 0, 2):
+            env.step(action)
+    assert env.recorded == 5
+    env.close()
+    with project.store() as store:
+        items, _ = store.items()
+    assert [item.content["key"] for item in items] == [[0, 1], [6, 1], [12, 3], [13, 0], [7, 2]]
+    assert project.damaged(items) == {}
+    assert {item.stratum for item in items} == {"training"}
+
+
+def test_clips_of_a_run_end_with_its_episodes(project):
+    env = gymnasium.make("uard/TrapGrid6-v0", render_mode="rgb_array", max_episode_steps=12)
+    env.action_space.seed(0)
+    env = ClipRecorder(env, project, share=1.0, length=5)
+    for _ in range(4):
+        env.reset(seed=0)
+        over = False
+        while not over:
+            *_, terminated, truncated, _ = env.step(env.action_space.sample())
+            over = terminated or truncated
+    env.close()
+    with project.store() as store:
+        items, _ = store.items()
+    frames = [item.content["frames"] for item in items]
+    assert len(frames) > 2
+    assert max(frames) == 6
+    assert all(f >= 2 for f in frames)
+
+
+def test_the_filter_of_a_gymnasium_run_hears_the_store(project):
+    """The wrapper keys by state and action, as the clips do."""
+    env = gymnasium.make("uard/TrapGrid6-v0", render_mode="rgb_array")
+    env = ClipRecorder(env, project, share=1.0)
+    ratings = StoreRatings(project, env.observation_space, env.action_space, poll=0.0)
+    env = ReliabilityWrapper(env, ratings=ratings)
+    env.reset(seed=0)
+    _, _, _, _, info = env.step(1)
+    assert not info.get("rated", False)
+    with project.store() as store:
+        (item,), _ = store.items()
+        for name in ("ann", "bob"):
+            store.invite(name)
+            store.put([Answer(f"{name}-1", item.id, name, -3.0)])
+    env.reset(seed=0)
+    reward = env.step(1)[1]
+    assert reward < -0.5  # two raters say so, the environment paid -0.1
+    env.close()
+
+
+def test_what_cannot_be_recorded_is_refused_at_once(project, tmp_path):
+    env = gymnasium.make("uard/TrapGrid6-v0")
+    with pytest.raises(InvalidValueError, match="rgb_array"):
+        ClipRecorder(env, project)
+    drawn = gymnasium.make("uard/TrapGrid6-v0", render_mode="rgb_array")
+    for name, value in (("share", 0.0), ("length", 0), ("most", 0), ("seed", -1)):
+        with pytest.raises(InvalidValueError, match=name):
+            ClipRecorder(drawn, project, **{name: value})
+    with pytest.raises(InvalidValueError, match="project"):
+        StoreRatings(tmp_path / "nowhere", *NUMBERED)
