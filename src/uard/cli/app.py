@@ -53,6 +53,8 @@ def _end(error: BaseException) -> None:
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
         signals.quiet_output()
         sys.exit(f"error: the output cannot be written ({error.strerror})")
+    if isinstance(error, ModuleNotFoundError) and "pip install 'uard[" in str(error):  # which says what to do already
+        sys.exit(f"error: {error}")
     if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] in _OF_LAB:
         sys.exit(f"the laboratory is not installed: pip install 'uard[lab]' ({error})")
 
@@ -112,5 +114,9 @@ def _of_users() -> tuple[type[Exception], ...]:
     """Return the errors that their message explains. A module that nobody has imported has raised none."""
     from uard import _checks
 
-    names = (("uard.lab.execution.store", "StoreError"), ("uard.lab.execution.cluster", "ClusterError"))
+    names = (
+        ("uard.lab.execution.store", "StoreError"),
+        ("uard.lab.execution.cluster", "ClusterError"),
+        ("uard.collect.store", "StoreError"),
+    )
     return (_checks.InvalidValueError, *(getattr(sys.modules[m], name) for m, name in names if m in sys.modules))

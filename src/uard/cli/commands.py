@@ -23,6 +23,7 @@ OWN = {
     "preferences": "preferences.Preferences",
     "raters": "raters.Raters",
     "judges": "judges.Judges",
+    "collect": "collect.Collect",
     "best-of-n": "best_of_n.BestOfN",
     "acquisition": "acquisition.AcquisitionStudy",
     "leaderboard": "leaderboard.Leaderboard",

@@ -1,0 +1,461 @@
+"""``uard collect``: from an agent or a file of answers to a page where people rate, and to a table. Needs no JAX."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
+
+from uard import __version__, _checks
+from uard._support.text import counted
+from uard.cli import progress, terminal
+from uard.cli.settings import Pairs
+from uard.cli.settings import settings as read
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from uard.collect import AnswerStore, Item, Project, Question
+
+Kind = Literal["slider", "stars", "thumbs", "pairs"]
+PORT = 8321
+PASSWORD = "UARD_OWNER_PASSWORD"  # an environment variable: an option would stand in everybody's list of processes
+_ROUND = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+_ASKED = {"thumbs": "Is this good?", "pairs": "Which of the two is better?"}
+_ENDINGS = {".csv": "csv", ".jsonl": "jsonl", ".parquet": "parquet", ".pq": "parquet", ".json": "label-studio"}
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What raters are asked, in a new project; that of an old one stands in its project.toml."""
+
+    kind: Kind | None = None
+    """How: slider, stars, thumbs, or pairs of items side by side."""
+    low: float | None = None
+    """The lowest value that can be given, in the reward's unit; by what was observed if left out."""
+    high: float | None = None
+    """The highest."""
+    stars: int | None = None
+    """How many, if the kind is stars."""
+    question: str | None = None
+    """The sentence above the item."""
+
+    def given(self) -> dict[str, Any]:
+        """Return what was said."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+ASKED = Asked()
+AskedOptions = Annotated[Asked, arg(name="")]
+
+
+@dataclass(frozen=True)
+class Record:
+    """Record clips of an agent in any Gymnasium environment that draws pictures.
+
+    Three commands lead to a page where people rate: pip install 'uard[collect,lab,mujoco]', uard collect record
+    Hopper-v5 hopper, uard collect serve hopper --raters ann,bob.
+    """
+
+    environment: Positional[str]
+    """The id of a Gymnasium environment, such as Hopper-v5, or a name of `uard run`, such as TrapGrid."""
+    project: Positional[str]
+    """A folder; made if it is not there, else clips are added."""
+    policy: str = "random"
+    """Who acts: random; sb3:FILE, an agent that Stable-Baselines3 has saved (PPO, A2C, DQN, SAC, TD3; such a file is
+    executed, so take none from a stranger; observations that were normalised in training are not normalised here); or
+    uard:STORE, an agent of `uard run --store` in a world of tables, @CELL or @CELL:SEED behind it if there are
+    several."""
+    segments: int = 200
+    """How many different clips."""
+    length: int = 50
+    """Steps of a clip; 1 for ratings of single state-actions."""
+    asked: AskedOptions = ASKED
+    pairs: int | None = None
+    """If the kind is pairs, how many; as many as clips if left out."""
+    stratum: str | None = None
+    """What the clips are called in statistics; the policy's name if left out."""
+    fps: float | None = None
+    """Frames per second; the environment's own, at most 30, if left out."""
+    set: Pairs = ()
+    """A keyword of the environment, e.g. size=8. Repeatable."""
+    seed: int = 0
+    """Of the environment, of random actions, and of where clips begin."""
+
+    def run(self, console: Console) -> None:
+        """Record, make the project, and say what comes next."""
+        from uard.cli import acting
+        from uard.collect.record import record
+
+        project = _begun(self.project, self.asked)
+        env = acting.environment(self.environment, read(self.set))
+        with closing(env):
+            act = acting.policy(self.policy, env)
+            with progress.bar(console, f"recording {self.environment}") as move:
+                clips = record(
+                    env,
+                    act.policy,
+                    project,
+                    segments=self.segments,
+                    length=self.length,
+                    seed=self.seed,
+                    fps=self.fps,
+                    stratum=act.name if self.stratum is None else self.stratum,
+                    progress=lambda done, total: move(done, total, None),
+                )
+        frames = sum(clip.content["frames"] for clip in clips)
+        paid = _paid(clips)
+        observed = f", observed reward per step {paid[0]:.3g} .. {paid[1]:.3g}" if paid else ""
+        terminal.say(console, f"{counted(len(clips), 'clip')} ({act.name}), {counted(frames, 'frame')}{observed}")
+        if len(clips) < self.segments:
+            terminal.say(console, f"fewer than {self.segments}: after these, no new ones came")
+        _finish(console, project, clips, self.asked, self.pairs, self.seed)
+
+
+@dataclass(frozen=True)
+class Texts:
+    """Take prompts and completions from a file."""
+
+    file: Positional[str]
+    """A JSONL, JSON, CSV or Parquet file with a prompt and a completion (or a list of them) per row, or chosen and
+    rejected, or messages; reward and model if they are there."""
+    project: Positional[str]
+    """A folder; made if it is not there, else texts are added."""
+    asked: AskedOptions = ASKED
+    pairs: int | None = None
+    """If the kind is pairs, how many; all completions of a prompt with each other if left out."""
+    seed: int = 0
+    """Of which pairs are drawn."""
+
+    def run(self, console: Console) -> None:
+        """Read, make the project, and say what comes next."""
+        from uard.collect.texts import texts
+
+        project = _begun(self.project, self.asked)
+        items = texts(self.file, project)
+        prompts = len({item.content["prompt"] for item in items})
+        terminal.say(console, f"{counted(len(items), 'completion')} of {counted(prompts, 'prompt')}")
+        asked = self.asked
+        if asked.kind is None and _is_new(project) and _paid(items) is None and len(items) == 2 * prompts:
+            asked = replace(asked, kind="pairs")  # such as chosen and rejected
+        _finish(console, project, items, asked, self.pairs, self.seed)
+
+
+@dataclass(frozen=True)
+class Serve:
+    """Show the page where people rate, and the owner's page, until it is stopped with Ctrl-C.
+
+    The owner's password is made anew at each start, and printed, unless the environment variable UARD_OWNER_PASSWORD
+    holds one.
+    """
+
+    project: Positional[str]
+    """A project's folder."""
+    raters: str = ""
+    """Names of the raters, with commas between them; each gets a link of their own. Raters who were invited before need
+    not be named again."""
+    port: int = PORT
+    """Where to listen."""
+    host: str = "127.0.0.1"
+    """Where to listen; 127.0.0.1 is this machine only."""
+    public_url: str | None = None
+    """The address by which raters reach the page, such as https://rate.example.org, if something stands before it."""
+    new_links: bool = False
+    """Give new links to raters who have one; the old ones are void."""
+
+    def run(self, console: Console) -> None:
+        """Serve."""
+        from uard.collect.asking import top_up
+        from uard.collect.serving import serve
+
+        def asking(project: Project, store: AnswerStore) -> Callable[[str, int], None]:
+            def ask(rater: str, count: int) -> None:
+                top_up(project, store, rater, count)
+
+            return ask
+
+        names = [name.strip() for name in self.raters.split(",") if name.strip()]
+        serve(
+            self.project,
+            names,
+            host=self.host,
+            port=self.port,
+            public_url=self.public_url,
+            owner_password=os.environ.get(PASSWORD) or None,
+            new_links=self.new_links,
+            top_up=asking,
+            say=lambda line: terminal.say(terminal.output(), line),
+        )
+
+
+@dataclass(frozen=True)
+class Invite:
+    """Give a rater a new link, also while the page is served; links that they had before are void."""
+
+    project: Positional[str]
+    """A project's folder."""
+    name: Positional[str]
+    """The rater's name, as it will stand in the table."""
+    url: str = f"http://127.0.0.1:{PORT}"
+    """The address by which raters reach the page."""
+
+    def run(self, console: Console) -> None:
+        """Invite."""
+        from uard.collect import Project
+
+        with closing(Project.open(self.project).store()) as store:
+            secret = store.invite(self.name)
+        terminal.say(terminal.output(), f"{self.url.rstrip('/')}/enter/{secret}")
+        terminal.say(console, f"give this link to {self.name}: it works once. Next: uard collect serve {self.project}")
+
+
+@dataclass(frozen=True)
+class Status:
+    """Say how far a project is: answers, by rater, and what is still to come."""
+
+    project: Positional[str]
+    """A project's folder."""
+    json: str | None = None
+    """Write one JSON object to this file; - for standard output."""
+
+    def run(self, console: Console) -> None:
+        """Read the store and print numbers."""
+        from uard.collect import Project
+
+        terminal.check_json(self.json)
+        project = Project.open(self.project)
+        found = _status(project)
+        if self.json is not None:
+            terminal.write_json({"version": __version__, "project": self.project} | found, self.json)
+        if self.json != "-":
+            rows = [_row(rater) for rater in found["raters"]]
+            if rows:
+                terminal.table(("rater", "answers", "skipped", "coverage", "link used"), rows, self.project)
+            out = terminal.output()
+            for line in _told(found):
+                terminal.say(out, line)
+        for name, why in found["damaged"].items():
+            terminal.warning(console, f"item {name} is not shown: {why}")
+        terminal.say(console, f"next: {_next(found, self.project)}")
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write the answers into a file."""
+
+    project: Positional[str]
+    """A project's folder."""
+    file: Positional[str]
+    """Where to: .csv, .jsonl, .parquet, or .json for Label Studio."""
+    form: Literal["csv", "jsonl", "parquet", "trl", "label-studio", "record"] | None = None
+    """What it holds; by its ending if left out. trl: preference rows; record: every answer that was ever given, those
+    that were taken back included."""
+
+    def run(self, console: Console) -> None:
+        """Read the store and write the file."""
+        from uard._support import files
+        from uard.collect import Project
+        from uard.ratings import export
+
+        form = self.form or _ENDINGS.get(Path(self.file).suffix.lower())
+        if form is None:
+            allowed = f"a file that ends in {', '.join(_ENDINGS)}, or --form says what it holds"
+            raise _checks.InvalidValueError("file", self.file, allowed)
+        project = Project.open(self.project)
+        files.prepare(self.file, "file", *(str(path) for path in project.folder.iterdir() if path.is_file()))
+        with closing(project.store()) as store:
+            (answers, _), (items, _) = store.answers(), store.items()
+        data = export.write(answers, {item.id: item.content for item in items}, form)
+        try:
+            with files.replacing(self.file) as file:
+                file.write(data)
+        except OSError as error:
+            allowed = f"a file that can be written ({error.strerror or error})"
+            raise _checks.InvalidValueError("file", self.file, allowed) from None
+        comparisons = project.question.kind == "pairs"
+        after = "uard preferences" if comparisons else "uard raters"
+        readable = form in ("csv", "jsonl", "parquet") and len(answers.standing())
+        told = f". Next: {after} {self.file}" if readable else ""
+        terminal.say(console, f"{counted(len(answers.standing()), 'answer')} in {self.file}{told}")
+
+
+_Action = (
+    Annotated[Record, subcommand("record")]
+    | Annotated[Texts, subcommand("texts")]
+    | Annotated[Serve, subcommand("serve")]
+    | Annotated[Invite, subcommand("invite")]
+    | Annotated[Status, subcommand("status")]
+    | Annotated[Export, subcommand("export")]
+)
+
+
+@dataclass(frozen=True)
+class Collect:
+    """Let people rate clips of an agent, or texts: record, serve the page, export what they said."""
+
+    action: OmitSubcommandPrefixes[Annotated[_Action, arg(name="")]]
+
+    def run(self, console: Console) -> None:
+        """Do what was asked for."""
+        self.action.run(console)
+
+
+def _begun(folder: str, asked: Asked) -> Project:
+    """Return a project that items can be put into; a new one has no question yet.
+
+    Raises:
+        InvalidValueError: the folder cannot be made; a question that cannot be, or one for a project that has its own.
+    """
+    from uard._support import files
+    from uard.collect import Project, Question
+    from uard.collect.project import MEDIA, SETTINGS
+
+    path = Path(folder)
+    if (path / SETTINGS).exists():
+        for name, value in asked.given().items():
+            raise _checks.InvalidValueError(f"--{name}", value, f"left out: it stands in {path / SETTINGS}")
+        return Project.open(path)
+    low, high = asked.low, asked.high
+    for name, value in (("--low", low), ("--high", high)):
+        if value is not None:
+            _checks.number(name, value, low=-_checks.LARGEST, high=_checks.LARGEST)
+    if low is not None and high is not None and not low < high:
+        raise _checks.InvalidValueError("--high", high, f"more than --low, {low:g}")
+    question = Question(**{n: v for n, v in asked.given().items() if n not in ("low", "high")})
+    files.prepare_folder(str(path / MEDIA), "project")
+    return Project(path, question)
+
+
+def _is_new(project: Project) -> bool:
+    from uard.collect.project import SETTINGS
+
+    return not (project.folder / SETTINGS).exists()
+
+
+def _finish(
+    console: Console, project: Project, items: Sequence[Item], asked: Asked, count: int | None, seed: int
+) -> None:
+    """Make a new project's question, and pairs if that is what it asks for; say what comes next."""
+    from uard.collect import Project
+
+    paid = _paid(items)
+    if _is_new(project):
+        question, why = _question(asked, items)
+        project = Project.create(project.folder, question)
+        terminal.say(console, f"raters are asked: {question.question} ({question.kind}{why})")
+    elif project.question.kind in ("slider", "stars") and paid is not None:
+        low, high = project.question.low, project.question.high
+        if paid[0] < low or paid[1] > high:
+            told = f"these pay {paid[0]:.3g} .. {paid[1]:.3g}, and raters can say {low:g} .. {high:g}"
+            terminal.warning(console, f"{told}: see low and high in {project.folder / 'project.toml'}")
+    if project.question.kind == "pairs":
+        from uard.collect.texts import pairs
+
+        few = len(items) if count is None and items and items[0].kind == "clip" else count
+        terminal.say(console, counted(len(pairs(items, project, few, seed)), "pair"))
+    terminal.say(console, f"next: uard collect serve {project.folder} --raters ann,bob")
+
+
+def _paid(items: Sequence[Item]) -> tuple[float, float] | None:
+    """Return the least and the most that items pay; None where none says."""
+    rewards = [item.reward for item in items if item.reward is not None]
+    return (min(rewards), max(rewards)) if rewards else None
+
+
+def _question(asked: Asked, items: Sequence[Item]) -> tuple[Question, str]:
+    """Return the question of a new project, and why its range is what it is.
+
+    The range is symmetric: what was paid for a hack may be as bad as it was paid well.
+    """
+    from uard.collect import Question
+
+    given = asked.given()
+    paid, texts = _paid(items), items[0].kind == "text"
+    kind = given.setdefault("kind", "stars" if texts and paid is None else "slider")
+    if kind in _ASKED:
+        given.setdefault("question", _ASKED[kind])
+    elif texts:
+        given.setdefault("question", "How good is this answer?")
+    if texts:
+        given["unit"] = "points" if paid is None else "points of the reward"
+    if paid is None:
+        low, high = (1.0, float(given.get("stars", 5))) if kind == "stars" else (-1.0, 1.0)
+        why = ""
+    else:
+        high = round_up(max(map(abs, paid)))
+        low, why = -high, ", the largest observed reward, rounded up, both ways"
+    given["low"], given["high"] = given.get("low", low), given.get("high", high)
+    if kind in ("thumbs", "pairs"):
+        return Question(**given), ""
+    chosen = asked.low is not None and asked.high is not None
+    return Question(**given), f" from {given['low']:g} to {given['high']:g}{'' if chosen else why}"
+
+
+def round_up(value: float) -> float:
+    """Return the next number that is easy to read; 1 for none.
+
+    Examples:
+        >>> round_up(2.13), round_up(0.1), round_up(87.0), round_up(0.0)
+        (2.5, 0.1, 100.0, 1.0)
+    """
+    import math
+
+    if value <= 0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(value))
+    nearest = next((m for m in _ROUND if m * power >= value * (1 - 1e-9)), 10.0)
+    return float(f"{nearest * power:.12g}")
+
+
+def _status(project: Project) -> dict[str, Any]:
+    from uard.collect.app.overview import overview
+
+    with closing(project.store()) as store:
+        (answers, _), (items, _), raters = store.answers(), store.items(), store.raters()
+        open_requests = len(store.open_requests()[0])
+    by_name = {item.id: item for item in items}
+    seen = overview(answers, by_name, project.question, [rater.name for rater in raters])
+    states = {rater.name: rater for rater in raters}
+    rows = [
+        {"name": r.name, "answers": r.answers, "skipped": r.skipped, "coverage": r.coverage}
+        | {"entered": r.name in states and states[r.name].entered}
+        | {"paused": r.name in states and states[r.name].paused}
+        for r in seen.raters
+    ]
+    return {
+        "items": seen.items,
+        "rated": seen.rated,
+        "complete": seen.complete,
+        "answers": seen.answers,
+        "wanted": seen.wanted,
+        "open_requests": open_requests,
+        "raters": rows,
+        "damaged": project.damaged(items),
+    }
+
+
+def _row(rater: dict[str, Any]) -> tuple[str, ...]:
+    name = f"{rater['name']} (paused)" if rater["paused"] else rater["name"]
+    used = "yes" if rater["entered"] else "no"
+    return name, str(rater["answers"]), str(rater["skipped"]), f"{rater['coverage']:.0%}", used
+
+
+def _told(found: dict[str, Any]) -> list[str]:
+    items, out = counted(found["items"], "item"), counted(found["open_requests"], "question")
+    return [
+        f"{items}, {found['rated']} of them rated, {found['complete']} by as many as wanted",
+        f"{found['answers']} of {found['wanted']} answers that are wanted; {out} given out and not answered yet",
+    ]
+
+
+def _next(found: dict[str, Any], folder: str) -> str:
+    if not found["raters"]:
+        return f"uard collect serve {folder} --raters ann,bob"
+    if found["answers"] < found["wanted"]:
+        return f"uard collect serve {folder}"
+    return f"uard collect export {folder} answers.csv"
