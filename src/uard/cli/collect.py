@@ -16,6 +16,7 @@ from uard._support.text import counted
 from uard.cli import progress, terminal
 from uard.cli.settings import Pairs
 from uard.cli.settings import settings as read
+from uard.cli.simulated import Simulate
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -291,6 +292,7 @@ _Action = (
     | Annotated[Invite, subcommand("invite")]
     | Annotated[Status, subcommand("status")]
     | Annotated[Export, subcommand("export")]
+    | Annotated[Simulate, subcommand("simulate")]
 )
 
 

@@ -214,12 +214,18 @@ class SQLiteStore(AnswerStore):
     def raters(self) -> tuple[RaterState, ...]:
         """See ``AnswerStore``."""
         with self._reading() as db:
-            rows = db.execute("SELECT name, paused FROM raters ORDER BY seq").fetchall()
+            rows = db.execute("SELECT name, paused, link FROM raters ORDER BY seq").fetchall()
             held: dict[str, set[str]] = {row["name"]: set() for row in rows}
             for row in db.execute("SELECT hash, rater FROM sessions"):
                 held.setdefault(row["rater"], set()).add(row["hash"])
         return tuple(
-            RaterState(row["name"], bool(row["paused"]), bool(held[row["name"]]), frozenset(held[row["name"]]))
+            RaterState(
+                row["name"],
+                paused=bool(row["paused"]),
+                entered=bool(held[row["name"]]),
+                invited=row["link"] is not None,
+                sessions=frozenset(held[row["name"]]),
+            )
             for row in rows
         )
 

@@ -88,12 +88,14 @@ class RaterState:
         name: As she was invited.
         paused: Whether she is shown nothing now.
         entered: Whether she has used a link.
+        invited: Whether she has a link that was not used yet.
         sessions: Hashes of the secrets by which her browsers are known.
     """
 
     name: str
     paused: bool
     entered: bool
+    invited: bool
     sessions: frozenset[str]
 
 
