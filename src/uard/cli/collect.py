@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from uard.cli.simulated import Simulate
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from uard.collect import AnswerStore, Item, Project, Question
+    from uard.collect import Item, Project, Question
 
 Kind = Literal["slider", "stars", "thumbs", "pairs"]
 PORT = 8321
@@ -171,14 +171,7 @@ class Serve:
 
     def run(self, console: Console) -> None:
         """Serve."""
-        from uard.collect.asking import top_up
         from uard.collect.serving import serve
-
-        def asking(project: Project, store: AnswerStore) -> Callable[[str, int], None]:
-            def ask(rater: str, count: int) -> None:
-                top_up(project, store, rater, count)
-
-            return ask
 
         names = [name.strip() for name in self.raters.split(",") if name.strip()]
         serve(
@@ -189,7 +182,6 @@ class Serve:
             public_url=self.public_url,
             owner_password=os.environ.get(PASSWORD) or None,
             new_links=self.new_links,
-            top_up=asking,
             say=lambda line: terminal.say(terminal.output(), line),
         )
 
