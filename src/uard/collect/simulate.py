@@ -225,7 +225,11 @@ class Simulation:
             for task in tasks[: None if self.most is None else self.most - len(done)]:
                 random = self._random(task, name)
                 said = self.said(task, place, random)
-                answer = {"id": self._id(task, name), "lease": task["lease"], "comment": "", "seconds": 1.0} | said
+                # The item, too: a server that was killed has forgotten its leases.
+                answer = {"id": self._id(task, name), "lease": task["lease"], "item": task["item"]["id"]} | said
+                if sides := task.get("sides"):
+                    answer |= {"left": sides[0], "right": sides[1]}
+                answer |= {"comment": "", "seconds": 1.0}
                 done.append(visitor.answer(answer)["stored"])
                 last = time.monotonic()
                 if self.pause:
