@@ -9,13 +9,14 @@ import json
 import os
 import secrets
 import socket
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import urlsplit
 
 from uard import _checks
+from uard.collect import asking
 from uard.collect.project import Project
 from uard.collect.store import AnswerStore
 
@@ -47,7 +48,8 @@ def serve(
         public_url: The address that raters see, where a server with TLS stands before this one.
         owner_password: For ``/owner``; made anew for each start if left out.
         new_links: Whether all raters are given new links; those of before are void, their browsers stay known.
-        top_up: Given the project and its store, returns what is called when there is too little to rate.
+        top_up: Given the project and its store, returns what asks a rater for more when there is too little to rate;
+            ``uard.collect.asking`` if left out.
         say: Prints a line.
 
     Raises:
@@ -67,14 +69,10 @@ def serve(
         address = f"http://{_as_written(host)}:{listener.getsockname()[1]}"
         announce(address)
         with project.store() as store:
-            app = create_app(
-                project,
-                store,
-                owner_password=password,
-                public_url=public_url,
-                top_up=None if top_up is None else top_up(project, store),
-            )
-            _tell_damage(project, store, say)
+            wrong = project.damaged(store.items()[0])
+            _tell_damage(wrong, say)
+            more = _asking(project, store, wrong) if top_up is None else top_up(project, store)
+            app = create_app(project, store, owner_password=password, public_url=public_url, top_up=more)
             url = (public_url or address).rstrip("/")
             links = invite(store, raters, new_links)
             for rater, secret in links:
@@ -83,6 +81,15 @@ def serve(
             say(f"owner: {url}/owner" + ("" if owner_password else f"  (password {password})"))
             say("Each link works once. Ctrl-C ends the server; every answer that was acknowledged is kept.")
             _run(uvicorn, app, listener, behind=public_url is not None)
+
+
+def _asking(project: Project, store: AnswerStore, wrong: Mapping[str, str]) -> Callable[[str, int], None]:
+    without = frozenset(wrong)
+
+    def more(rater: str, count: int) -> None:
+        asking.top_up(project, store, rater, count, without)
+
+    return more
 
 
 def invite(store: AnswerStore, raters: Sequence[str], new_links: bool = False) -> list[tuple[str, str]]:
@@ -108,8 +115,7 @@ def _tell_known(store: AnswerStore, new: Collection[str], say: Callable[[str], N
         say(f"known by their browsers already: {', '.join(entered)} (--new-links makes links for other browsers)")
 
 
-def _tell_damage(project: Project, store: AnswerStore, say: Callable[[str], None]) -> None:
-    wrong = project.damaged(store.items()[0])
+def _tell_damage(wrong: Mapping[str, str], say: Callable[[str], None]) -> None:
     if wrong:
         several = f"{len(wrong)} item{'s are' if len(wrong) > 1 else ' is'}"
         say(f"{several} set aside, and shown to nobody; answers that exist are kept:")
@@ -172,7 +178,7 @@ def _as_written(host: str) -> str:
 
 
 @contextmanager
-def _listening(host: str, port: int) -> Iterator[socket.socket]:
+def _listening(host: str, port: int) -> Generator[socket.socket]:
     kind = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(kind) as listener:
         if os.name == "posix":  # a port whose last server ended a moment ago is free; elsewhere this means to share it
@@ -194,7 +200,7 @@ def _what_port(error: OSError, host: str) -> str:
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[Callable[[str], None]]:
+def _alone(folder: Path) -> Generator[Callable[[str], None]]:
     """Hold the project's lock, which ends with the process, however that ends; what is yielded tells the address."""
     path = folder / LOCK
     with path.open("a+b") as file:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jinja2
 from starlette.datastructures import Headers
@@ -37,7 +37,7 @@ def _environment() -> jinja2.Environment:
     loader = jinja2.FileSystemLoader(HERE / "templates")
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     environment.trim_blocks = environment.lstrip_blocks = True
-    environment.globals.update(short=short, percent=percent)
+    cast("dict[str, Any]", environment.globals).update(short=short, percent=percent)  # pyright: ignore[reportUnknownMemberType]
     return environment
 
 

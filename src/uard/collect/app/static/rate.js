@@ -412,6 +412,7 @@ function handle(event) {
   }
   if (/^[0-9]$/.test(key)) {
     if (!rows[active].digit(Number(key))) return false;
+    hint("");
     const missing = rows.findIndex((row) => !row.isSet);
     if (rows.length > 1 && missing >= 0) activate(missing, true);
     return true;
@@ -419,6 +420,7 @@ function handle(event) {
   if (key.startsWith("Arrow")) {
     const upDown = key === "ArrowUp" || key === "ArrowDown";
     if (target.matches?.(".scrub") || (upDown && target.matches?.(".text"))) return false;
+    hint("");
     return rows[active].arrow(key, event.shiftKey);
   }
   const does = {

@@ -93,6 +93,7 @@ export class RadioRow {
 
   pick(at) {
     if (at < 0 || at >= this.inputs.length) return false;
+    if (this.inputs.includes(document.activeElement)) this.inputs[at].focus();
     this.inputs[at].checked = true;
     this.mark();
     return true;
