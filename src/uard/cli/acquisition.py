@@ -43,7 +43,7 @@ class AcquisitionStudy:
             if target is not None:
                 terminal.write_json(data, target, field, indent=None)
         if "-" not in (self.json, self.extract):
-            terminal.show(shown.table(data))
-            terminal.show(shown.budgets(data))
+            for table in shown.tables(data):
+                terminal.show(table)
             for loss in shown.losses(data):
                 print(printable(loss))

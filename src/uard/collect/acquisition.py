@@ -297,14 +297,17 @@ class _Plan:
     """What can still be asked while requests are chosen one by one. Changed in place."""
 
     def __init__(self, known: Known, acquisition: Acquisition, random: np.random.Generator):
-        self._known, self._random, self._share = known, random, acquisition.repeats
-        answered = known.count > 0
-        self._free = ~(answered | known.asked | known.paused)  # who can be asked about which item
+        self._random, self._share = random, acquisition.repeats
+        there = np.flatnonzero(~known.paused)  # often one of many
+        self._items, self._raters = known.items, [known.raters[k] for k in there]
+        count, asked = known.count[:, there], known.asked[:, there]
+        answered = count > 0
+        self._free = ~(answered | asked)  # who can be asked about which item
         self._room = acquisition.overlap - known.heard
         self._fresh = np.ones(len(known.items), bool)  # not chosen yet in this round: one question an item and round
-        self._load = known.count.sum(0) + known.asked.sum(0)
-        self._again = (known.count == 1) & ~np.isnan(known.ratings) & ~known.asked & ~known.paused
-        self._repeated = np.maximum(known.count - 1, 0).sum(0) + (known.asked & answered).sum(0)
+        self._load = count.sum(0) + asked.sum(0)
+        self._again = (count == 1) & ~np.isnan(known.ratings[:, there]) & ~asked
+        self._repeated = np.maximum(count - 1, 0).sum(0) + (asked & answered).sum(0)
 
     def rating(self, order: Integer[np.ndarray, " n"]) -> Request | None:
         """Choose the first item of an order that somebody can be asked about, and whom; None if there is none."""
@@ -319,7 +322,7 @@ class _Plan:
         self._room[item] -= 1
         self._fresh[item] = self._free[item, rater] = False
         self._load[rater] += 1
-        return Request(self._known.items[item], self._known.raters[rater])
+        return Request(self._items[item], self._raters[rater])
 
     def repeat(self) -> Request | None:
         """Choose a repeat if one is due, by chance and not at once; None otherwise."""
@@ -333,7 +336,7 @@ class _Plan:
         self._again[item, rater] = False
         self._repeated[rater] += 1
         self._load[rater] += 1
-        return Request(self._known.items[item], self._known.raters[rater], "repeat")
+        return Request(self._items[item], self._raters[rater], "repeat")
 
     def _of(self, numbers: Integer[np.ndarray, " m"]) -> int:
         return int(numbers[self._random.integers(len(numbers))])

@@ -1,4 +1,4 @@
-"""Who is asked what, in the report: whether asking at random is as good, found by rule; one figure, two tables."""
+"""Who is asked what, in the report: whether asking at random is as good, found by rule; one figure, three tables."""
 
 from __future__ import annotations
 
@@ -125,8 +125,8 @@ def _named(c: Compared) -> str:
 
 
 def _signed(gap: Summary, digits: int) -> str:
-    ends = f" [{gap.ci95[0]:+.{digits}f}, {gap.ci95[1]:+.{digits}f}]" if gap.ci95 else " (one run)"
-    return f"{gap.mean:+.{digits}f}{ends}"
+    mean, *ends = (f"{round(x, digits) + 0.0:+.{digits}f}" for x in (gap.mean, *(gap.ci95 or ())))  # no -0.0
+    return f"{mean} [{', '.join(ends)}]" if ends else f"{mean} (one run)"
 
 
 def _mean(values: np.ndarray, digits: int) -> str:
@@ -135,43 +135,45 @@ def _mean(values: np.ndarray, digits: int) -> str:
     return f"{s.mean:.{digits}f}{ends}"
 
 
-def table(data: Mapping[str, Any]) -> Table:
-    """Return what is tested: answers needed and mean regret by setting and rule, and the difference to random."""
-    tests = {(c.setting, c.rule): (c, d) for c, d in zip(compare(data, needed), compare(data, over_all), strict=True)}
+def tables(data: Mapping[str, Any]) -> list[Table]:
+    """Return answers needed, mean regret, and regret at fixed numbers of answers, each by setting and rule."""
+    last, target = data["answers"][-1], data["target"]
+    return [
+        _tested(
+            data,
+            needed,
+            0,
+            f"answers until regret is at most {target:g}",
+            f"For good; where that is never, {last} are counted.",
+        ),
+        _tested(data, over_all, 3, f"mean regret from no answer to {last}", ""),
+        budgets(data),
+    ]
+
+
+def _tested(data: Mapping[str, Any], measure: Measure, digits: int, what: str, note: str) -> Table:
+    """Return a measure by setting and rule, and the difference to random."""
+    compared = compare(data, measure)
+    tests = {(c.setting, c.rule): c for c in compared}
     rows: list[tuple[str, ...]] = []
     for setting in data["settings"]:
         for r in setting["rules"]:
             regret = np.array(r["regret"])
-            reached = int((regret[:, -1] <= data["target"]).sum())
-            cells = [f"{_mean(needed(data, regret), 0)} ({reached} of {len(regret)})", "", ""]
-            more = [_mean(over_all(data, regret), 3), "", ""]
-            if found := tests.get((setting["setting"], r["rule"])):
-                cells[1:] = _signed(found[0].gap, 0), f"{found[0].corrected:.2g}"
-                more[1:] = _signed(found[1].gap, 3), f"{found[1].corrected:.2g}"
-            rows.append((setting["setting"], r["rule"], *cells, *more))
+            found = tests.get((setting["setting"], r["rule"]))
+            more = ("", "") if found is None else (_signed(found.gap, digits), f"{found.corrected:.2g}")
+            reached = f"{(regret[:, -1] <= data['target']).sum()} of {len(regret)}"
+            rows.append((setting["setting"], r["rule"], _mean(measure(data, regret), digits), *more, reached))
+    columns = ("items", "rule", "mean [95 %]", "more than random [95 %]", "p (Holm)", "reached at last")
+    alone = sum(c.p < statistics.LEVEL for c in compared)
+    tuned = ", some of which may be tuned on" if any(map(is_for_development, data["seeds"])) else ""
     return Table(
-        "Who is asked what: against asking at random",
-        (
-            *("items", "rule"),
-            *(f"answers until regret <= {data['target']:g} (reached)", "more than random", "p (Holm)"),
-            *("mean regret", "more than random", "p (Holm)"),
-        ),
+        f"Who is asked what: {what}",
+        columns,
         tuple(rows),
         2,
-        _note(data, [c for pair in tests.values() for c in pair]),
-    )
-
-
-def _note(data: Mapping[str, Any], tests: list[Compared]) -> str:
-    seeds, last, target = data["seeds"], data["answers"][-1], data["target"]
-    tuned = " (some of which may be tuned on)" if any(map(is_for_development, seeds)) else ""
-    alone = sum(c.p < statistics.LEVEL for c in tests)
-    return (
-        f"Mean [95 % interval] over {len(seeds)} seeds{tuned}; {data['command']}. Regret: 0 is the best, 1 a random "
-        f"walk or a clip picked at random. Answers until it is at most {target:g} for good; where that is never, "
-        f"{last} are counted. Mean regret: from no answer to {last}. Paired sign-flip tests by seed, corrected for "
-        f"{len(tests) // 2} in each of the two families; uncorrected {alone} of {len(tests)} differ, about "
-        f"{statistics.LEVEL * len(tests):.1f} would by chance."
+        f"{note} Over {len(data['seeds'])} seeds{tuned}; {data['command']}. Regret: 0 is the best, 1 a random walk or "
+        f"a clip picked at random. Paired sign-flip tests by seed, corrected for {len(compared)}; uncorrected {alone} "
+        f"differ, about {statistics.LEVEL * len(compared):.1f} would by chance.".strip(),
     )
 
 
@@ -180,20 +182,26 @@ def budgets(data: Mapping[str, Any]) -> Table:
     places = [data["answers"].index(b) for b in data["budgets"]]
     rows: list[tuple[str, ...]] = []
     for setting in data["settings"]:
-        low, high = min(setting["items"]), max(setting["items"])
-        size = f"{low}" if low == high else f"{low} to {high}"
+        whole = _mean(np.array(setting["everything"]), 2)
         for r in setting["rules"]:
             regret = np.array(r["regret"])
-            rows.append((setting["setting"], size, r["rule"], *(_mean(regret[:, i], 2) for i in places)))
-        everything = _mean(np.array(setting["everything"]), 2)
-        rows.append((setting["setting"], size, "everybody has rated everything", *("" for _ in places[1:]), everything))
+            cells = (_mean(regret[:, i], 2) for i in places)
+            rows.append((setting["setting"], r["rule"], *cells, whole if r["rule"] == BASE else ""))
+    sizes = "; ".join(
+        f"{s['setting']}: {_span(s['items'])} items, {_span(s['raters'])} raters" for s in data["settings"]
+    )
     return Table(
         "Who is asked what: regret at fixed numbers of answers",
-        ("items", "how many", "rule", *(f"{b} answers" for b in data["budgets"])),
+        ("items", "rule", *(f"{b} answers" for b in data["budgets"]), "all that all can say"),
         tuple(rows),
-        3,
-        f"Mean [95 % interval] over {len(data['seeds'])} seeds; not tested for themselves.",
+        2,
+        f"Mean [95 % interval] over {len(data['seeds'])} seeds; not tested for themselves. {sizes}.",
     )
+
+
+def _span(numbers: list[int]) -> str:
+    low, high = min(numbers), max(numbers)
+    return f"{low}" if low == high else f"{low} to {high}"
 
 
 def figure(data: Mapping[str, Any]) -> Figure:

@@ -169,8 +169,7 @@ def _acquisition() -> list[Section]:
         HERE,
         "acquisition.html.j2",
         figure=picture("Regret against answers, by rule", note, figures.data_uri(acquisition.figure(data))),
-        table=acquisition.table(data),
-        budgets=acquisition.budgets(data),
+        tables=acquisition.tables(data),
     )
     return [Section("acquisition", "Who is asked what", 92, html, losses=tuple(acquisition.losses(data)))]
 
