@@ -180,7 +180,8 @@ def _as_written(host: str) -> str:
 @contextmanager
 def _listening(host: str, port: int) -> Generator[socket.socket]:
     kind = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(kind) as listener:
+    # Named as TCP, for asyncio sends small answers at once on such sockets only; on others each waits for 40 ms.
+    with socket.socket(kind, socket.SOCK_STREAM, socket.IPPROTO_TCP) as listener:
         if os.name == "posix":  # a port whose last server ended a moment ago is free; elsewhere this means to share it
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
