@@ -130,7 +130,8 @@ def picture(env: gymnasium.Env[Any, Any], before: tuple[int, ...] | None = None)
     shape: tuple[int, ...] = getattr(found, "shape", ())
     kind: Any = getattr(found, "dtype", None)
     if type(found) is not np.ndarray or kind != np.uint8 or len(shape) != 3 or shape[2] != 3 or 0 in shape:
-        what: object = cast("object", found) if kind is None else f"{kind} {shape}"
+        plain: object = cast("object", found) if isinstance(found, str | None) else f"a {type(found).__name__}"
+        what = plain if kind is None else f"{kind} {shape}"
         raise _checks.InvalidValueError("render()", what, "a picture, an array (H, W, 3) of uint8")
     if before is not None and shape != before:
         raise _checks.InvalidValueError("render().shape", shape, f"{before}, as in the pictures before")

@@ -1,0 +1,267 @@
+"""``uard collect``: from an environment or a file to a project, and to a table."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from uard.cli import app as cli
+from uard.cli.projects import round_up
+from uard.collect import Project, sheets
+from uard.ratings.table import Answer
+
+
+@pytest.fixture
+def run(capsys, tmp_path, monkeypatch):
+    """Run a command in an empty folder, and return its exit code and what it printed."""
+    monkeypatch.chdir(tmp_path)
+
+    def running(*arguments):
+        try:
+            cli.main(["collect", *map(str, arguments)])
+            code = 0
+        except SystemExit as stopped:
+            code = stopped.code
+        out, err = capsys.readouterr()
+        return code, out, " ".join(err.split())
+
+    return running
+
+
+def items_of(folder):
+    with Project.open(folder).store() as store:
+        return store.items()[0]
+
+
+def test_a_grid_is_recorded_rated_and_exported(run, tmp_path):
+    code, _, err = run("record", "TrapGrid", "grid", "--segments", 12, "--length", 1)
+    assert code == 0
+    assert "12 clips (random), 24 frames, observed reward per step" in err
+    assert "raters are asked: How much reward does this deserve? (slider from -" in err
+    assert err.endswith("next: uard collect serve grid --raters ann,bob")
+    items = items_of("grid")
+    assert {i.stratum for i in items} == {"random"}
+    assert all(len(i.content["key"]) == 2 for i in items)
+
+    code, out, err = run("invite", "grid", "ann", "--url", "https://rate.example.org/")
+    assert code == 0
+    assert out.startswith("https://rate.example.org/enter/")
+    with Project.open("grid").store() as store:
+        store.invite("bob")
+        store.put([Answer("a1", items[0].id, "ann", 0.5, scale="slider -4..4", given_at=3.0)])
+        store.put([Answer("a2", items[0].id, "bob", choice="skip")])
+    code, out, err = run("status", "grid")
+    assert code == 0
+    assert "12 items, 1 of them rated, 0 by as many as wanted" in out
+    assert err.endswith("next: uard collect serve grid")
+    code, out, _ = run("status", "grid", "--json", "-")
+    told = json.loads(out)
+    assert (told["items"], told["wanted"], told["open_requests"]) == (12, 36, 0)
+    assert [(r["name"], r["answers"], r["skipped"], r["entered"]) for r in told["raters"]] == [
+        ("ann", 1, 0, False),
+        ("bob", 1, 1, False),
+    ]
+
+    code, _, err = run("export", "grid", "said.csv")
+    assert code == 0
+    assert "2 answers in said.csv. Next: uard raters said.csv" in err
+    with open("said.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert (rows[0]["item"], rows[0]["rater"], float(rows[0]["rating"])) == (items[0].id, "ann", 0.5)
+    assert run("export", "grid", "said.json")[0] == 0
+    assert json.loads((tmp_path / "said.json").read_text())
+    assert run("export", "grid", "all.txt", "--form", "record")[0] == 0
+
+
+def test_a_project_keeps_its_question(run):
+    assert run("record", "TrapGrid6", "grid", "--segments", 4, "--kind", "stars", "--stars", 3, "--high", 2)[0] == 0
+    question = Project.open("grid").question
+    assert (question.kind, question.stars, question.high) == ("stars", 3, 2.0)
+    code, _, err = run("record", "TrapGrid6", "grid", "--kind", "thumbs")
+    assert code == 2
+    assert "--kind = 'thumbs': must be left out: it stands in grid/project.toml" in err
+    assert run("record", "TrapGrid6", "grid", "--segments", 3, "--stratum", "again", "--seed", 5)[0] == 0
+    assert {i.stratum for i in items_of("grid")} == {"random", "again"}
+
+
+def test_pairs(run):
+    code, _, err = run("record", "TrapGrid6", "grid", "--segments", 6, "--length", 4, "--kind", "pairs", "--pairs", 5)
+    assert code == 0
+    assert "Which of the two is better? (pairs)" in err
+    assert "5 pairs" in err
+    assert [i.kind for i in items_of("grid")].count("pair") == 5
+    assert Project.open("grid").question.kind == "pairs"
+
+
+def test_the_agent_of_a_finished_run_acts(run, capsys):
+    for mitigation in ("raw", "true-reward"):
+        cli.main(
+            ["run", "TrapGrid6", "--seeds", "1", "--episodes", "200", "--mitigation", mitigation, "--store", "runs.db"]
+        )
+    capsys.readouterr()
+    code, _, err = run("record", "TrapGrid6", "grid", "--policy", "uard:runs.db")
+    assert code == 2
+    assert "must be uard:STORE@CELL, with the beginning of one cell's key: @" in err
+    assert not os.path.exists("grid")
+    key = next(part for part in err.split("@")[1:] if "TrueReward" in part)[:8]
+    code, _, err = run("record", "TrapGrid6", "grid", "--policy", f"uard:runs.db@{key}", "--segments", 4)
+    assert code == 0
+    assert "seed 0), " in err
+    project = Project.open("grid")
+    longest = max(items_of("grid"), key=lambda item: item.content["frames"])
+    with np.load(project.media(longest.content["data"])) as found:
+        assert found["rewards"][-1] == 10.0  # it goes to the goal
+        assert (found["rewards"][:-1] < 0).all()  # past the traps
+    for policy, message in (
+        (f"uard:runs.db@{key}:7", "with a seed that is finished: [0]"),
+        (f"uard:runs.db@{key}:x", "with a seed that is a number"),
+        ("uard:none.db", "must be a result store that is there"),
+    ):
+        code, _, err = run("record", "TrapGrid6", "grid", "--policy", policy)
+        assert code == 2
+        assert message in err
+    code, _, err = run("record", "TrapGrid8", "grid", "--policy", "uard:runs.db")
+    assert code == 2
+    assert "a store with a finished run in this environment" in err
+
+
+@pytest.mark.parametrize("name", ["PPO", "A2C", "DQN"])
+def test_an_agent_of_stable_baselines3_acts(run, name):
+    sb3 = pytest.importorskip("stable_baselines3")
+    import gymnasium
+
+    import uard.envs
+
+    assert uard.envs
+    env = gymnasium.make("uard/TrapGrid6-v0")
+    small = {"buffer_size": 10} if name == "DQN" else {}
+    getattr(sb3, name)("MlpPolicy", env, device="cpu", **small).save("agent.zip")
+    code, _, err = run("record", "TrapGrid6", "grid", "--policy", "sb3:agent.zip", "--segments", 3, "--length", 4)
+    assert code == 0
+    assert f"({name} agent)" in err
+    code, _, err = run("record", "TrapGrid8", "grid", "--policy", "sb3:agent.zip")
+    assert code == 2
+    assert "observation_space of agent.zip = Discrete(36): must be Discrete(64), as the environment's" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("BoatRace",), "environment = 'BoatRace': must be one that draws pictures"),
+        (("Trapgrid8",), "did you mean 'TrapGrid8'?"),
+        (("Nope-v3",), "must be the id of a Gymnasium environment"),
+        (("no_such_module:Nope-v3",), "must be one that can be made here"),
+        (("TrapGrid", "--set", "sise=3"), "keyword of TrapGrid = 'sise': must be one of"),
+        (("TrapGrid", "--policy", "clever"), "--policy = 'clever': must be random, sb3:FILE or uard:STORE"),
+        (("TrapGrid", "--policy", "sb3:none.zip"), "must be a file that can be read (No such file"),
+        (("TrapGrid", "--policy", "sb3:text.zip"), "must be a zip file that Stable-Baselines3's save() has written"),
+        (("TrapGrid", "--segments", "0"), "segments = 0: must be a whole number"),
+        (("TrapGrid", "--length", "5000"), "length = 5000: must be a whole number in [1, 1023]"),
+        (("TrapGrid", "--low", "3", "--high", "2"), "--high = 2.0: must be more than --low, 3"),
+        (("TrapGrid", "--stars", "1"), "stars = 1: must be a whole number in [2, 10]"),
+        (("TrapGrid", "--fps", "0"), "fps = 0.0: must be a finite number in (0, 1000]"),
+    ],
+)
+def test_bad_input_leaves_nothing_behind(run, tmp_path, arguments, message):
+    (tmp_path / "text.zip").write_text("no zip")
+    code, _, err = run("record", arguments[0], "grid", *arguments[1:])
+    assert code == 2
+    assert message in err
+    assert not (tmp_path / "grid").exists()
+
+
+def test_texts(run, tmp_path):
+    rows = [{"prompt": f"{i} + 1?", "chosen": str(i + 1), "rejected": "<b>no</b>"} for i in range(3)]
+    (tmp_path / "answers.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    code, _, err = run("texts", "answers.jsonl", "sums")
+    assert code == 0
+    assert "6 completions of 3 prompts" in err
+    assert "3 pairs next: uard collect serve sums --raters ann,bob" in err
+    code, _, err = run("texts", "answers.jsonl", "stars", "--kind", "stars")
+    assert "How good is this answer? (stars from 1 to 5)" in err
+    (tmp_path / "bad.jsonl").write_text('{"prompt": "a", "completion": 3}')
+    code, _, err = run("texts", "bad.jsonl", "none")
+    assert code == 2
+    assert "bad.jsonl: row 1, column 'completion' = 3" in err
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("command", ["status", "invite", "export", "serve"])
+def test_a_project_that_is_none(run, command):
+    more = {"invite": ("ann",), "export": ("a.csv",)}.get(command, ())
+    code, _, err = run(command, "nowhere", *more)
+    assert code == 2
+    assert "project = 'nowhere': must be a folder that `uard collect record` or `uard collect texts` has made" in err
+
+
+def test_what_changed_after_it_was_recorded_is_told(run):
+    run("record", "TrapGrid6", "grid", "--segments", 2, "--length", 1)
+    project, (one, other) = Project.open("grid"), items_of("grid")
+    project.media(one.content["sheet"]).write_bytes(b"another picture")
+    project.media(other.content["data"]).unlink()
+    code, _, err = run("status", "grid")
+    assert code == 0
+    assert f"item {one.id} is not shown: " in err
+    assert "was changed after it was recorded" in err
+    assert "is missing" in err
+
+
+def test_an_export_must_have_a_form_and_destroys_nothing(run):
+    run("record", "TrapGrid6", "grid", "--segments", 2, "--length", 1)
+    code, _, err = run("export", "grid", "said.txt")
+    assert code == 2
+    assert "or --form says what it holds" in err
+    code, _, err = run("export", "grid", "grid/answers.sqlite", "--form", "csv")
+    assert code == 2
+    assert "which it would destroy" in err
+
+
+def test_a_store_of_another_version_is_left_alone(run, tmp_path):
+    import sqlite3
+
+    run("record", "TrapGrid6", "grid", "--segments", 2, "--length", 1)
+    with sqlite3.connect(tmp_path / "grid" / "answers.sqlite") as db:
+        db.execute("PRAGMA user_version = 99")
+    code, _, err = run("status", "grid")
+    assert code == 2
+    assert "made by a newer uard" in err
+
+
+def test_without_the_extra_it_is_said_what_to_install(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    code, _, _ = run("record", "TrapGrid", "grid", "--segments", 2)
+    assert "pip install 'uard[collect]'" in code
+
+
+@pytest.mark.parametrize(
+    ("value", "rounded"), [(2.13, 2.5), (0.1, 0.1), (1.0, 1.0), (0.0, 1.0), (9.2e-7, 1e-6), (87, 100.0), (6.0, 6.0)]
+)
+def test_ranges_are_easy_to_read(value, rounded):
+    assert round_up(value) == rounded
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the library is chosen on Linux only")
+def test_hopper_is_recorded_without_a_screen(tmp_path):
+    """In a process of its own, for what draws is chosen once."""
+    pytest.importorskip("mujoco")
+    hidden = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY")
+    environment = {name: value for name, value in os.environ.items() if name not in hidden}
+    command = [sys.executable, "-m", "uard", "collect", "record", "Hopper-v5", "hopper", "--segments", "6"]
+    ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+    if "EGL or OSMesa" in ended.stderr:
+        pytest.skip("neither EGL nor OSMesa is installed, and the message says so")
+    assert ended.returncode == 0, ended.stderr
+    assert "6 clips (random)" in ended.stderr
+    project = Project.open(tmp_path / "hopper")
+    with project.store() as store:
+        content = max((item.content for item in store.items()[0]), key=lambda c: c["frames"])
+    size = content["width"], content["height"]
+    data = project.media(content["sheet"]).read_bytes()
+    frames = sheets.frames_of(data, content["frames"], content["columns"], size)
+    assert size == (256, 256)
+    assert len(np.unique(frames[0].reshape(-1, 3), axis=0)) > 50  # something is to be seen
+    assert (frames[0] != frames[-1]).any()
