@@ -1,6 +1,7 @@
 """The control study of who is asked what: exact returns by hand, the same answers for all, and what the report says."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +9,18 @@ import pytest
 from uard.cli.app import main
 from uard.envs.grids.trapgrid import TrapGrid
 from uard.lab.studies import acquisition
-from uard.lab.studies.acquisition import ANSWERS, PAIRS, RULES, TRAPS, answering, best_policy, grid_case, value
+from uard.lab.studies.acquisition import (
+    ANSWERS,
+    CLIPS,
+    GRIDS,
+    PAIRS,
+    RULES,
+    TRAPS,
+    answering,
+    best_policy,
+    grid_case,
+    value,
+)
 from uard.lab.views import acquisition as views
 from uard.lab.views import page, published
 from uard.ratings.panels import is_for_development, random_panel
@@ -123,19 +135,28 @@ def test_answers_needed_are_counted_from_the_last_time_regret_was_too_high():
     assert fixed.columns[-2:] == ("10 answers", "all that all can say")
 
 
-def test_what_is_published_is_of_held_out_seeds_and_stands_in_the_report():
-    data = published.packaged_json("acquisition.json")
-    assert len(data["seeds"]) >= 10
+@pytest.mark.parametrize(("name", "seeds"), [("acquisition.json", 10), ("acquisition-again.json", 30)])
+def test_what_is_published_is_of_held_out_seeds(name, seeds):
+    data = published.packaged_json(name)
+    assert len(set(data["seeds"])) == seeds
     assert not any(map(is_for_development, data["seeds"]))
     assert data["answers"] == list(ANSWERS)
     for setting in data["settings"]:
         assert tuple(r["rule"] for r in setting["rules"]) == acquisition.rules(setting["setting"])
-        assert all(np.array(r["regret"]).shape == (len(data["seeds"]), len(ANSWERS)) for r in setting["rules"])
+        assert all(np.array(r["regret"]).shape == (seeds, len(ANSWERS)) for r in setting["rules"])
+
+
+def test_the_second_run_has_seeds_of_its_own():
+    first, again = (set(published.packaged_json(f"acquisition{x}.json")["seeds"]) for x in ("", "-again"))
+    assert not first & again
+
+
+def test_what_is_published_stands_in_the_report():
     (section,) = page._acquisition()
-    assert section.losses == tuple(views.losses(data))
-    for loss in section.losses:
-        assert "random is" in loss
-    assert "at most 0.25" in section.html
+    assert section.losses == tuple(views.losses(published.packaged_json("acquisition-again.json")))
+    assert all("random is" in loss for loss in section.losses)
+    for text in ("at most 0.25", "--seeds 10 --first-seed 1000", "--seeds 30 --first-seed 1010", "<img"):
+        assert text in section.html
 
 
 def test_what_is_published_is_what_the_command_gives():
@@ -159,3 +180,22 @@ def test_the_command(tmp_path, capsys, monkeypatch):
     shown = capsys.readouterr().out
     assert "mean regret" in shown
     assert "random is as good as" in shown
+
+
+def test_the_guide_says_what_was_published():
+    data = published.packaged_json("acquisition-again.json")
+    guide = (Path(__file__).parents[2] / "docs" / "guides" / "acquisition.md").read_text()
+    lines = [[cell.strip().strip("`") for cell in line.split("|")[1:-1]] for line in guide.splitlines()]
+    needed, mean, _ = views.tables(data)
+    rows = zip(needed.rows, mean.rows, strict=True)
+    assert [[*b[:5], a[2]] for a, b in rows] == [
+        row for row in lines if len(row) == 6 and row[0] in acquisition.settings()
+    ]
+    found = views.compare(data, views.over_all)
+    better = {(c.setting, c.rule) for c in found if c.told_apart and c.gap.mean < 0}
+    rules = ("highest-reward", "half random, half highest-reward")
+    expected = {(s, rule) for s in (TRAPS, GRIDS, CLIPS) for rule in rules} | {(CLIPS, "least-known")}
+    assert better == expected
+    assert not [c for c in found if c.told_apart and c.gap.mean > 0]
+    first = published.packaged_json("acquisition.json")
+    assert not [c for measure in (views.needed, views.over_all) for c in views.compare(first, measure) if c.told_apart]
