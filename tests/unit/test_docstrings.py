@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-PACKAGES = ("method", "ratings", "judges", "diagnosis", "adapters", "envs", "agents", "training", "lab")
+PACKAGES = ("method", "ratings", "judges", "diagnosis", "adapters", "collect", "envs", "agents", "training", "lab")
 DOCS = Path(__file__).parents[2] / "docs"
 PARSER = doctest.DocTestParser()
 

@@ -35,6 +35,10 @@ class LinkUsedError(ValueError):
 class Request:
     """That somebody should rate an item.
 
+    Examples:
+        >>> Request("0" * 32, rater="ann", priority=2.0).kind
+        'rating'
+
     Attributes:
         item: Its name.
         rater: Who; anybody who has not rated it yet if left out. A repeat names who rated it before.
@@ -113,6 +117,13 @@ class AnswerStore(ABC):
     """The interface. All methods may be called from any thread, and by several processes on one store.
 
     All raise ``StoreError`` if the database cannot do it now; then nothing of the call has happened.
+
+    Examples:
+        >>> import tempfile
+        >>> from uard.collect.project import Project
+        >>> with tempfile.TemporaryDirectory() as folder, Project.create(folder).store() as store:
+        ...     isinstance(store, AnswerStore), store.raters()
+        (True, ())
     """
 
     @abstractmethod
