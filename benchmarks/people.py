@@ -86,7 +86,7 @@ def main() -> None:
             links = {rater: store.invite(rater) for rater in raters}
         panel = Panel(tuple(Rater(noise=0.3) for _ in raters))
         visit = Simulation(
-            f"http://127.0.0.1:{port}", links, question, law_by_reward(panel), idle=20.0, most=each, pause=chosen.pause
+            f"http://127.0.0.1:{port}", links, project, law_by_reward(panel), idle=20.0, most=each, pause=chosen.pause
         )
         over, away = threading.Event(), []
         killer = threading.Thread(

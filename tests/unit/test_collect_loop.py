@@ -140,6 +140,22 @@ def test_a_run_records_each_numbered_step_once(project):
     assert {item.stratum for item in items} == {"training"}
 
 
+def test_what_a_run_does_often_is_asked_again(project):
+    env = gymnasium.make("uard/TrapGrid6-v0", render_mode="rgb_array")
+    env = ClipRecorder(env, project, share=1.0, again=2)
+    with project.store() as store:
+        store.invite("ann")
+        for seed in range(5):
+            env.reset(seed=seed)
+            env.step(1)
+        env.close()
+        (item,), _ = store.items()
+        kinds = [lease.kind for lease in store.lease("ann", 9)]
+    assert item.content["key"] == [0, 1]
+    assert kinds == ["repeat"]  # never two of one item at once
+    assert env.recorded == 1
+
+
 def test_clips_of_a_run_end_with_its_episodes(project):
     env = gymnasium.make("uard/TrapGrid6-v0", render_mode="rgb_array", max_episode_steps=12)
     env.action_space.seed(0)
@@ -184,7 +200,7 @@ def test_what_cannot_be_recorded_is_refused_at_once(project, tmp_path):
     with pytest.raises(InvalidValueError, match="rgb_array"):
         ClipRecorder(env, project)
     drawn = gymnasium.make("uard/TrapGrid6-v0", render_mode="rgb_array")
-    for name, value in (("share", 0.0), ("length", 0), ("most", 0), ("seed", -1)):
+    for name, value in (("share", 0.0), ("length", 0), ("most", 0), ("again", -1), ("seed", -1)):
         with pytest.raises(InvalidValueError, match=name):
             ClipRecorder(drawn, project, **{name: value})
     with pytest.raises(InvalidValueError, match="project"):

@@ -72,7 +72,7 @@ class Simulate:
             links = {f"simulated-{k + 1}": "" for k in range(len(panel.raters))}
             links = {name: store.invite(name) for name in links}
         visit = Simulation(
-            self.url, links, project.question, law_of, self.seed, pause=self.pause, idle=self.idle, most=self.answers
+            self.url, links, project, law_of, self.seed, pause=self.pause, idle=self.idle, most=self.answers
         )
         report = visit.run()
         for name, why in report.errors.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ from uard.collect import drawing, sheets
 from uard.collect.items import Item
 from uard.collect.project import Project
 from uard.collect.record import LONGEST, Clip, as_array, keep_clip
+from uard.collect.store import Request
 
 EACH = 16  # clips that are put into the store in one go
+AFTER = -1.0  # the priority of what was asked before: new questions first
 
 
 class ClipRecorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
@@ -50,6 +53,7 @@ class ClipRecorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         share: float = 0.05,
         length: int = 1,
         most: int = 100_000,
+        again: int = 0,
         stratum: str = "training",
         seed: int = 0,
     ):
@@ -62,6 +66,8 @@ class ClipRecorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
             length: Steps of a clip, in [1, 1023]; a clip that an episode's end cuts short is shorter. With one, in a
                 world of numbered states and actions, each state-action is recorded once.
             most: Clips after which none is recorded any more.
+            again: How often a numbered state-action that is drawn once more is put before all raters again, so that
+                what the agent does often is known best; as hidden repeats, >= 0.
             stratum: What the clips are called by.
             seed: Of which steps are recorded, >= 0.
 
@@ -73,21 +79,23 @@ class ClipRecorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         _checks.number("share", share, low=0, high=1, open_low=True)
         _checks.whole("length", length, low=1, high=LONGEST)
         _checks.whole("most", most, low=1)
+        _checks.whole("again", again)
         _checks.whole("seed", seed)
         drawing.check(env)
         gymnasium.utils.RecordConstructorArgs.__init__(
-            self, project=project, share=share, length=length, most=most, stratum=stratum, seed=seed
+            self, project=project, share=share, length=length, most=most, again=again, stratum=stratum, seed=seed
         )
         super().__init__(env)
         self._project = project if isinstance(project, Project) else Project.open(project)
         self._store = self._project.store()
-        self._length, self._most, self._stratum = length, most, stratum
+        self._length, self._most, self._again, self._stratum = length, most, again, stratum
         self._chance = share / length  # that a clip begins at a step
         self._random = np.random.default_rng(seed)
         self._numbered = length == 1 and natural_key(env.observation_space, env.action_space) is not None
         self._rate = drawing.speed(env, None)
-        self._seen: set[Any] = set()
+        self._seen: dict[tuple[int, int], _Seen] = {}
         self._waiting: list[Item] = []
+        self._once_more: list[str] = []
         self._clip: _Clip | None = None
         self._observation: Any = None
         self._simple = False
@@ -129,10 +137,17 @@ class ClipRecorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         key = None
         if self._numbered:
             key = (int(self._observation), int(action))
-            if key in self._seen:
+            if (seen := self._seen.get(key)) is not None:
+                self._repeat(seen)
                 return
-            self._seen.add(key)
         self._clip = _Clip(self._frame(), as_array(self.env, "observation_space", self._observation), key)
+
+    def _repeat(self, seen: _Seen) -> None:
+        if seen.times < self._again:
+            seen.times += 1
+            self._once_more.append(seen.item)
+            if len(self._once_more) >= EACH:
+                self._flush()
 
     def _frame(self) -> np.ndarray:
         return sheets.fitted(drawing.picture(self.env))
@@ -142,7 +157,10 @@ class ClipRecorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         if clip is None or not clip.actions:
             return
         made = Clip.of(clip.frames, clip.observations, clip.actions, clip.rewards, clip.key)
-        self._waiting.append(keep_clip(made, self._project, self._rate, self._stratum))
+        item = keep_clip(made, self._project, self._rate, self._stratum)
+        self._waiting.append(item)
+        if clip.key is not None:
+            self._seen[clip.key[0], clip.key[1]] = _Seen(item.id)
         self.recorded += 1
         if len(self._waiting) >= EACH or self.recorded <= EACH:  # the first at once: somebody waits at the page
             self._flush()
@@ -151,6 +169,23 @@ class ClipRecorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         if self._waiting:
             self._store.add_items(self._waiting)
             self._waiting = []
+        if self._once_more:
+            names = [r.name for r in self._store.raters() if not r.paused]
+            self._store.ask([Request(item, name, "repeat", AFTER) for item in self._once_more for name in names])
+            self._once_more = []
+
+
+@dataclass
+class _Seen:
+    """A numbered state-action that was recorded.
+
+    Attributes:
+        item: Its name.
+        times: How often it was put before the raters again.
+    """
+
+    item: str
+    times: int = 0
 
 
 class _Clip:

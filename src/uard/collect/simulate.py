@@ -12,14 +12,15 @@ import socket
 import threading
 import time
 import urllib.parse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
 
 from uard import _checks
-from uard.collect.project import Question
+from uard.collect.project import Project, Question
+from uard.collect.store import AnswerStore
 from uard.ratings.panels import Panel, RatingLaw, draw
 
 Content = Mapping[str, Any]
@@ -166,7 +167,7 @@ class Simulation:
     Attributes:
         url: Of the server.
         links: Secret of each rater's link by her name, in the panel's order.
-        question: What the page asks.
+        project: What the page serves. Raters are not told what the environment paid; the panel's law reads it here.
         law_of: How the panel rates an item.
         seed: Of what raters draw.
         pause: Seconds between two answers of a rater.
@@ -176,7 +177,7 @@ class Simulation:
 
     url: str
     links: Mapping[str, str]
-    question: Question
+    project: Project
     law_of: LawOf
     seed: int = 0
     pause: float = 0.0
@@ -191,13 +192,15 @@ class Simulation:
         """
         report, lock = Report(), threading.Lock()
         stop = stop or threading.Event()
+        store = self.project.store()
+        known = _Contents(store)
 
         def work(place: int, name: str) -> None:
             visitor = Visitor(self.url)
             done: list[str] = []
             try:
                 visitor.enter(self.links[name])
-                self._visit(visitor, place, name, done, stop)
+                self._visit(visitor, known, place, name, done, stop)
             except Exception as error:  # one rater's trouble is reported, and does not end the others
                 report.errors[name] = f"{type(error).__name__}: {error}"
             finally:
@@ -211,9 +214,12 @@ class Simulation:
             thread.start()
         for thread in threads:
             thread.join()
+        store.close()
         return report
 
-    def _visit(self, visitor: Visitor, place: int, name: str, done: list[str], stop: threading.Event) -> None:
+    def _visit(
+        self, visitor: Visitor, known: _Contents, place: int, name: str, done: list[str], stop: threading.Event
+    ) -> None:
         last = time.monotonic()
         while not stop.is_set() and (self.most is None or len(done) < self.most):
             tasks = visitor.ask("/api/next", {"count": 2})["tasks"]
@@ -224,10 +230,11 @@ class Simulation:
                 continue
             for task in tasks[: None if self.most is None else self.most - len(done)]:
                 random = self._random(task, name)
-                said = self.said(task, place, random)
+                sides = task.get("sides") or [task["item"]["id"]]
+                said = self.said([known[x] for x in sides], place, random)
                 # The item, too: a server that was killed has forgotten its leases.
                 answer = {"id": self._id(task, name), "lease": task["lease"], "item": task["item"]["id"]} | said
-                if sides := task.get("sides"):
+                if len(sides) == 2:
                     answer |= {"left": sides[0], "right": sides[1]}
                 answer |= {"comment": "", "seconds": 1.0}
                 done.append(visitor.answer(answer)["stored"])
@@ -235,48 +242,61 @@ class Simulation:
                 if self.pause:
                     stop.wait(self.pause)
 
-    def said(self, task: Mapping[str, Any], place: int, random: np.random.Generator) -> dict[str, Any]:
-        """Return what the panel's rater at a place says of a task.
-
-        Examples:
-            >>> from uard.ratings.panels import PANELS
-            >>> one = Simulation("http://x", {}, Question(kind="stars"), law_by_reward(PANELS["single"]))
-            >>> one.said({"item": {"reward": 1.0}}, 0, np.random.default_rng(0))["values"]
-            {'': 1.0}
+    def said(self, sides: Sequence[Content], place: int, random: np.random.Generator) -> dict[str, Any]:
+        """Return what the panel's rater at a place says of an item, or of a pair.
 
         Args:
-            task: As the server sends it.
+            sides: Content of the item, or of what stands on the left and on the right.
             place: Of the rater in the panel, from 0.
             random: What she draws from.
         """
-        if self.question.kind == "pairs":
-            return self._choice(task, place, random)
-        value = self._value(cast("Content", task["item"]), place, random)
-        if value is None:
-            return {"values": None, "choice": "skip"}
-        if self.question.kind == "thumbs":
-            up = value > (self.question.low + self.question.high) / 2
-            return {"values": None, "choice": "up" if up else "down"}
-        return {"values": {name: value for name in ("", *self.question.attributes)}, "choice": None}
-
-    def _choice(self, task: Mapping[str, Any], place: int, random: np.random.Generator) -> dict[str, Any]:
-        sides = [self._value(cast("Content", task[side]), place, random) for side in ("left", "right")]
-        if sides[0] is None or sides[1] is None:
-            return {"values": None, "choice": "cannot tell"}
-        near = abs(sides[0] - sides[1]) <= NEAR
-        return {"values": None, "choice": "tie" if near else "left" if sides[0] > sides[1] else "right"}
+        question = self.project.question
+        values = [self._value(content, place, random) for content in sides]
+        if any(value is None for value in values):
+            return {"values": None, "choice": "cannot tell" if question.kind == "pairs" else "skip"}
+        value, *other = cast("list[float]", values)
+        if question.kind == "pairs":
+            tie = abs(value - other[0]) <= NEAR
+            return {"values": None, "choice": "tie" if tie else "left" if value > other[0] else "right"}
+        if question.kind == "thumbs":
+            return {"values": None, "choice": "up" if value > (question.low + question.high) / 2 else "down"}
+        return {"values": {name: value for name in ("", *question.attributes)}, "choice": None}
 
     def _value(self, content: Content, place: int, random: np.random.Generator) -> float | None:
         drawn = draw(self.law_of(content), random)[place]
         if np.isnan(drawn):
             return None
-        question = self.question
-        if question.kind == "stars":
-            return min(question.levels, key=lambda level: abs(level - drawn))
-        return float(np.clip(drawn, question.low, question.high))
+        return nearest(float(drawn), self.project.question)
 
     def _random(self, task: Mapping[str, Any], name: str) -> np.random.Generator:
         return np.random.default_rng(list(hashlib.sha256(f"{self.seed} {name} {task['lease']}".encode()).digest()))
 
     def _id(self, task: Mapping[str, Any], name: str) -> str:
         return hashlib.sha256(f"{name} {task['lease']}".encode()).hexdigest()[:32]
+
+
+class _Contents:
+    """What is in items, read from a store as they come."""
+
+    def __init__(self, store: AnswerStore):
+        self._store, self._known, self._place = store, dict[str, Content](), 0
+        self._lock = threading.Lock()
+
+    def __getitem__(self, name: str) -> Content:
+        with self._lock:
+            if name not in self._known:
+                items, self._place = self._store.items(self._place)
+                self._known |= {item.id: item.content for item in items}
+            return self._known[name]
+
+
+def nearest(value: float, question: Question) -> float:
+    """Return what comes nearest to a value of what can be answered.
+
+    Examples:
+        >>> nearest(0.7, Question(low=-1.0, high=1.0)), nearest(0.7, Question(kind="stars", low=0.0, high=2.0, stars=3))
+        (0.7, 1.0)
+    """
+    if question.kind == "stars":
+        return min(question.levels, key=lambda level: abs(level - value))
+    return float(np.clip(value, question.low, question.high))
