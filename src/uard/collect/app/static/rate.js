@@ -4,7 +4,7 @@ import { Outbox, newId, post } from "./outbox.js";
 import { Stage, prepare, showAll } from "./player.js";
 import { RadioRow, SliderRow, shortened } from "./rows.js";
 
-const AHEAD = 2; // items that are held ready beside the one that is shown
+const AHEAD = 3; // items that are held ready beside the one that is shown
 const MOST = 20; // that the server hands out at once
 const POLL = 3000; // milliseconds between two looks for something new
 const REST = 300; // milliseconds in which a second click or key press cannot be meant for the new item
@@ -24,6 +24,7 @@ let shownAt = 0;
 let active = 0; // the row that digits and arrows are for
 let waiting = null; // the practice answer whose feedback is awaited
 let undoing = null; // the undo whose item is awaited
+let asked; // when the last answer was given, until the next item is there
 let turn = 0; // grows with every item, so that what comes late is known to be late
 let paused = false;
 let answered = 0;
@@ -126,6 +127,7 @@ function release(task) {
 
 // Shows the next item; `since` is when the last one was answered.
 async function next(since) {
+  asked = since ?? asked;
   const mine = ++turn;
   current = tasks.shift() ?? null;
   if (!current) {
@@ -149,21 +151,23 @@ async function next(since) {
       return;
     }
   }
-  show(task, since);
+  show(task);
 }
 
-function show(task, since) {
+function show(task) {
   place.message.hidden = true;
   place.work.hidden = false;
   find("practice").hidden = task.kind !== "practice";
   stage.show(task.parts, task.sides ? ["Left", "Right"] : [task.item.kind === "text" ? "Text" : "Clip"]);
   for (const row of rows) row.reset();
   if (comment) comment.value = "";
-  activate(0);
+  activate(0, rows.some((row) => row.place.contains(document.activeElement)));
   find("undo").disabled = !history.length;
   shownAt = performance.now();
   if (document.querySelector("dialog[open]")) stage.stop();
   document.body.dataset.item = task.item.id;
+  const since = asked;
+  asked = undefined;
   if (since) requestAnimationFrame(() => { document.body.dataset.switched = String(performance.now() - since); });
 }
 
@@ -175,7 +179,7 @@ function submit(event, skip = false) {
   const missing = skip ? [] : rows.filter((row) => !row.isSet);
   if (soon && (skip || missing.length)) return;
   if (missing.length) {
-    hint(missing[0].name ? `Still to rate: ${missing.map((row) => row.name || "your rating").join(", ")}.` : "Choose something first, or skip.");
+    hint(rows.length > 1 ? `Still to rate: ${missing.map((row) => row.name || "your rating").join(", ")}.` : "Choose something first, or skip.");
     activate(rows.indexOf(missing[0]), true);
     return;
   }
@@ -317,7 +321,7 @@ function showStatus() {
   if (late) parts.push(`Not saved yet: ${number === 1 ? "1 answer waits" : `${number} answers wait`} for the connection.`);
   if (late && outbox.why) parts.push(outbox.why);
   if (!outbox.kept && number) parts.push("Keep this page open: this browser stores nothing for us.");
-  if (noteText) parts.push(noteText);
+  if (noteText && !late) parts.push(noteText);
   const text = parts.join(" ");
   if (place.status.textContent !== text) place.status.textContent = text;
   place.status.classList.toggle("warning", Boolean(late));
@@ -352,6 +356,8 @@ function open(id, then) {
   stage.stop();
   dialog.addEventListener("close", () => {
     shownAt = performance.now();
+    const missing = rows.findIndex((row) => !row.isSet);
+    if (rows.length > 1 && missing >= 0 && !place.work.hidden) activate(missing, true); // the browser gives the focus back to where it was
     if (then) then();
     else if (current && !place.work.hidden && stage.autoplay && !window.matchMedia("(prefers-reduced-motion: reduce)").matches) stage.play();
   }, { once: true });
