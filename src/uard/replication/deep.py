@@ -17,6 +17,7 @@ from uard.replication import distortion, figures, paper
 from uard.replication.studies.derive import SIGMA_QUALITY
 
 AGENT = {"DQN": "dqn", "CQL": "cql", "CPO": "cpo", "TRPO": "trpo"}  # of the paper's Table 3
+OURS = "uard"
 COLOURS = {
     "dqn": "#c1272d", "ensemble-dqn": "#e08214", "cql": "#8c6d31", "sunrise": "#d6589f", "ppo": "#2c6fbb",
     "trpo": "#17a2b8", "cpo": "#7b4fa3", "cpo-oracle": "#b9a0d0", "sac": "#444444", "edac": "#999933",
@@ -70,12 +71,13 @@ def _mitigated(p: Published) -> Table:
     rows = []
     for r in p.rows("deep-uard"):
         s = [full(p.of(r, m)) for m in ("hacks", "success_rate", "true_return")]
-        rows.append((r["agent"], f"{r['trap']:+g}", r["panel"], *s))
+        rows.append((r["agent"], f"{r['trap']:+g}", r["panel"], r["mitigation"], *s))
     return Table(
-        "Every agent with uard-0.1, 10x10, T = 100, one setting, ratings through the learned model",
-        ("agent", "trap", "panel", "trap visits", "goal rate", "true return"),
+        "Every agent with uard and uard-0.1, 10x10, T = 100, one setting of each, ratings through a learned model",
+        ("agent", "trap", "panel", "mitigation", "trap visits", "goal rate", "true return"),
         tuple(rows),
-        3,
+        4,
+        "uard learns the gap between each rater and the reward, uard-0.1 what all raters say together.",
     )
 
 
@@ -89,18 +91,19 @@ def _rivals(p: Published) -> Table:
         ("agent", "panel", "mitigation", "trap visits", "true return", "goal rate"),
         tuple(rows),
         3,
+        "All of them listen to one model of each rater: rules are compared here, not models.",
     )
 
 
 def matched(p: Published) -> list[str]:
-    """Say for each agent and panel whether ``uard-0.1`` has the highest true return among those that hack no more than it.
+    """Say for each agent and panel whether ``uard`` has the highest true return among those that hack no more than it.
 
-    A rival counts as matched if its hack rate is not above ``uard-0.1``'s. All rivals, agents and panels are one family of
+    A rival counts as matched if its hack rate is not above ``uard``'s. All rivals, agents and panels are one family of
     paired tests for hacks, and one for true returns (Holm).
     """
     every = [
         (x, r)
-        for r in p.rows("deep-rivals", mitigation="uard-0.1")
+        for r in p.rows("deep-rivals", mitigation=OURS)
         for x in p.rows("deep-rivals", agent=r["agent"], panel=r["panel"])
         if x is not r
     ]
@@ -111,7 +114,7 @@ def matched(p: Published) -> list[str]:
     for agent in dict.fromkeys(r["agent"] for r in p.rows("deep-rivals")):
         for panel in ("main", "appendix"):
             group = p.rows("deep-rivals", agent=agent, panel=panel)
-            mine = [r for r in group if r["mitigation"] == "uard-0.1"]
+            mine = [r for r in group if r["mitigation"] == OURS]
             if not mine:
                 continue
             equals = [r for r in group if r is not mine[0] and r not in more]
@@ -136,48 +139,63 @@ def matched(p: Published) -> list[str]:
 
 
 def losses(p: Published) -> list[str]:
-    """Say where ``uard-0.1`` fails or is beaten in deep agents, found by rule."""
+    """Say where ``uard`` fails or is beaten in deep agents, found by rule."""
+    settings = p.rows("deep-uard", mitigation=OURS)
     missed = [
         f"{r['agent']} {r['trap']:+g} {r['panel']}: visits {_visits(p, r)}, goal {brief(p.of(r, 'success_rate'))}"
-        for r in p.rows("deep-uard")
+        for r in settings
         if p.of(r, "hacks").mean > 0.5 or p.of(r, "success_rate").mean < 0.95
     ]
     out = []
-    if p.rows("deep-uard"):
-        text = f"Deep agents on 10x10: of {len(p.rows('deep-uard'))} settings uard-0.1 misses 0.5 visits or 95 % goals in {len(missed)}"
+    if settings:
+        text = (
+            f"Deep agents on 10x10: of {len(settings)} settings uard misses 0.5 visits or 95 % goals in {len(missed)}"
+        )
         out.append(text + (": " + "; ".join(missed) if missed else "") + ".")
     unable = [r for r in p.rows("deep-competence") if p.of(r, "success_rate").mean < 0.95]
     if unable:
         goals = "; ".join(f"{r['agent']} {brief(p.of(r, 'success_rate'))}" for r in unable)
         out.append(
-            f"On the true reward of 10x10 these agents miss 95 % goals in the paper's budget, so what they do there with uard-0.1 says little: {goals}."
+            f"On the true reward of 10x10 these agents miss 95 % goals in the paper's budget, so what they do there with uard says little: {goals}."
         )
     out += matched(p)
-    sources = [
+    return [*out, *_of_sources(p), *_lost_goals(p)]
+
+
+def _of_sources(p: Published) -> list[str]:
+    """Say where the learned model of the ratings does worse than a table of them."""
+    pairs = [
         (r, model)
         for r in p.rows("deep-feedback", source="table")
-        for model in p.rows("deep-feedback", source="model", rated=r["rated"])
+        for model in p.rows("deep-feedback", source="model", rated=r["rated"], mitigation=r["mitigation"])
     ]
-    family = p.compare(sources, "true_return")
-    for i, (r, model) in enumerate(sources):
+    family = p.compare(pairs, "true_return")
+    out = []
+    for i, (r, model) in enumerate(pairs):
         if family.above(i):
             table, learned = (full(p.of(x, "true_return")) for x in (r, model))
             out.append(
-                f"With {100 * r['rated']:g} % of steps rated, the learned model of the ratings does worse than a table of running "
-                f"means: {learned} against {table}. Here it extrapolates what few ratings do not support. {family.caption()}"
+                f"{r['mitigation']} with {100 * r['rated']:g} % of steps rated: the learned model of the ratings does worse than "
+                f"a table of running means: {learned} against {table}. Here it extrapolates what few ratings do not support. "
+                f"{family.caption()}"
             )
+    return out
+
+
+def _lost_goals(p: Published) -> list[str]:
+    """Say in which settings ``uard`` has runs that no longer find the goal."""
     settings = [
-        (r, f"{r['agent']}, {r['panel']} panel, very noisy raters")
-        for r in p.rows("deep-rivals", mitigation="uard-0.1")
+        (r, f"{r['agent']}, {r['panel']} panel, very noisy raters") for r in p.rows("deep-rivals", mitigation=OURS)
     ]
     settings += [
         (r, f"ensemble-dqn, a {r['source']} of the ratings, {100 * r['rated']:g} % rated")
-        for r in p.rows("deep-feedback")
+        for r in p.rows("deep-feedback", mitigation=OURS)
     ]
+    out = []
     for r, where in settings:
         goals = p.per_seed(r, "success_rate")
         if lost := int((goals < 0.5).sum()):
-            out.append(f"uard-0.1 lost the goal in {lost} of {len(goals)} runs: {where}.")
+            out.append(f"{OURS} lost the goal in {lost} of {len(goals)} runs: {where}.")
     return out
 
 
@@ -228,13 +246,13 @@ def _feedback(p: Published) -> Table:
         got = [brief(statistics.summarise(errors[:, i])) for i in range(len(RATING_ERROR))]
         auroc = brief(statistics.summarise(ranks[:, CALIBRATION.index("auroc_with_proxy")]))
         visits, true = (brief(p.of(r, m)) for m in ("hacks", "true_return"))
-        rows.append((r["source"], f"{100 * r['rated']:g} %", *got, auroc, visits, true))
+        rows.append((r["mitigation"], r["source"], f"{100 * r['rated']:g} %", *got, auroc, visits, true))
     return Table(
         "What the learner knows of its raters: running means, or a model of the ratings (10x10, main panel)",
-        ("source", "rated", "mean, rated", "mean, unrated", "sigma_h, rated", "sigma_h, unrated", "AUROC count",
+        ("mitigation", "source", "rated", "mean, rated", "mean, unrated", "sigma_h, rated", "sigma_h, unrated", "AUROC count",
          "AUROC hack", "trap visits", "true return"),
         tuple(rows),
-        2,
+        3,
         "Errors are root mean squares against what the panel would say, in reward units, over state-actions that were rated "
         "and that never were. AUROC count: does the model know which are which? AUROC hack: sigma_h (proxy counted) as a detector.",
     )  # fmt: skip
