@@ -7,7 +7,7 @@ import pytest
 import uard.envs  # noqa: F401 - registers the environments
 from uard._checks import InvalidValueError
 from uard.adapters.gymnasium import ReliabilityWrapper
-from uard.collect import Project, clip_item
+from uard.collect import Project, clip_item, recorder
 from uard.collect.clip_model import FEWEST, ClipModel, RatedClip
 from uard.collect.loop import StoreRatings
 from uard.collect.recorder import ClipRecorder
@@ -138,6 +138,18 @@ def test_a_run_records_each_numbered_step_once(project):
     assert [item.content["key"] for item in items] == [[0, 1], [6, 1], [12, 3], [13, 0], [7, 2]]
     assert project.damaged(items) == {}
     assert {item.stratum for item in items} == {"training"}
+
+
+def test_a_rare_step_does_not_wait_for_others(project, monkeypatch):
+    monkeypatch.setattr(recorder, "SOON", 0.0)
+    env = ClipRecorder(gymnasium.make("uard/TrapGrid6-v0", render_mode="rgb_array"), project, share=1.0)
+    env.reset(seed=0)
+    for action in [1, 1, 1, 1, 3, 3, 3, 3, 0, 0, 0, 0, 2, 2, 2, 2, 1, 0, 1, 0, 1, 3]:
+        env.step(action)
+    env.reset(seed=0)
+    with project.store() as store:
+        assert len(store.items()[0]) == env.recorded > 16
+    env.close()
 
 
 def test_what_a_run_does_often_is_asked_again(project):

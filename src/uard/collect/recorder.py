@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from uard.collect.record import LONGEST, Clip, as_array, keep_clip
 from uard.collect.store import Request
 
 EACH = 16  # clips that are put into the store in one go
+SOON = 0.5  # seconds after which fewer are, between two episodes: a rare step must not wait for others
 AFTER = -1.0  # the priority of what was asked before: new questions first
 
 
@@ -98,12 +100,14 @@ class ClipRecorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         self._once_more: list[str] = []
         self._clip: _Clip | None = None
         self._observation: Any = None
-        self._simple = False
+        self._simple, self._flushed = False, 0.0
         self.recorded = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; a clip that was not finished ends where the episode was left."""
         self._finish()
+        if time.monotonic() - self._flushed > SOON:
+            self._flush()
         self._observation, info = super().reset(seed=seed, options=options)
         if not self._simple:
             drawing.find_library(self.env)
@@ -166,6 +170,7 @@ class ClipRecorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
             self._flush()
 
     def _flush(self) -> None:
+        self._flushed = time.monotonic()
         if self._waiting:
             self._store.add_items(self._waiting)
             self._waiting = []
