@@ -109,7 +109,7 @@ def made_up(differences, seeds=10):
     wobble = np.linspace(-0.1, 0.1, seeds)[:, None] * np.ones(3)
     rules += [{"rule": rule, "regret": (1 + more + wobble).tolist()} for rule, more in differences.items()]
     setting = {"setting": "grids", "items": [4], "raters": [2], "everything": [0.0] * seeds, "rules": rules}
-    numbers = {"answers": [0, 10, 20], "budgets": [10], "target": 0.5, "round": 10}
+    numbers = {"answers": [0, 10, 20], "budgets": [10], "target": 0.5, "round": 10, "overlap": 3}
     return {"command": "uard acquisition", "seeds": list(range(1001, 1001 + seeds)), **numbers, "settings": [setting]}
 
 
@@ -135,9 +135,13 @@ def test_answers_needed_are_counted_from_the_last_time_regret_was_too_high():
     assert fixed.columns[-2:] == ("10 answers", "all that all can say")
 
 
-@pytest.mark.parametrize(("name", "seeds"), [("acquisition.json", 10), ("acquisition-again.json", 30)])
-def test_what_is_published_is_of_held_out_seeds(name, seeds):
+@pytest.mark.parametrize(
+    ("name", "seeds", "overlap"),
+    [("acquisition.json", 10, 7), ("acquisition-again.json", 30, 7), ("acquisition-overlap.json", 30, 3)],
+)
+def test_what_is_published_is_of_held_out_seeds(name, seeds, overlap):
     data = published.packaged_json(name)
+    assert data["overlap"] == overlap
     assert len(set(data["seeds"])) == seeds
     assert not any(map(is_for_development, data["seeds"]))
     assert data["answers"] == list(ANSWERS)
@@ -153,9 +157,10 @@ def test_the_second_run_has_seeds_of_its_own():
 
 def test_what_is_published_stands_in_the_report():
     (section,) = page._acquisition()
-    assert section.losses == tuple(views.losses(published.packaged_json("acquisition-again.json")))
+    files = ("acquisition-again.json", "acquisition-overlap.json")
+    assert section.losses == tuple(loss for name in files for loss in views.losses(published.packaged_json(name)))
     assert all("random is" in loss for loss in section.losses)
-    for text in ("at most 0.25", "--seeds 10 --first-seed 1000", "--seeds 30 --first-seed 1010", "<img"):
+    for text in ("at most 0.25", "--seeds 10 --first-seed 1000", "--seeds 30 --first-seed 1010 --overlap 3", "<img"):
         assert text in section.html
 
 
@@ -171,11 +176,12 @@ def test_what_is_published_is_what_the_command_gives():
 
 def test_the_command(tmp_path, capsys, monkeypatch):
     run = acquisition.run
-    monkeypatch.setattr(acquisition, "run", lambda seeds: run(seeds, [TRAPS]))
-    main(["acquisition", "--seeds", "2", "--first-seed", "0", "--extract", str(tmp_path / "out.json"), "--json", "-"])
+    monkeypatch.setattr(acquisition, "run", lambda seeds, overlap: run(seeds, [TRAPS], overlap))
+    options = ["--seeds", "2", "--first-seed", "0", "--overlap", "2"]
+    main(["acquisition", *options, "--extract", str(tmp_path / "out.json"), "--json", "-"])
     printed = json.loads(capsys.readouterr().out)
     assert printed == json.loads((tmp_path / "out.json").read_text())
-    assert printed["command"] == "uard acquisition --seeds 2 --first-seed 0"
+    assert printed["command"] == "uard acquisition --seeds 2 --first-seed 0 --overlap 2"
     main(["acquisition", "--seeds", "2", "--first-seed", "0"])
     shown = capsys.readouterr().out
     assert "mean regret" in shown
@@ -186,11 +192,20 @@ def test_the_guide_says_what_was_published():
     data = published.packaged_json("acquisition-again.json")
     guide = (Path(__file__).parents[2] / "docs" / "guides" / "acquisition.md").read_text()
     lines = [[cell.strip().strip("`") for cell in line.split("|")[1:-1]] for line in guide.splitlines()]
+    shown = [row for row in lines if len(row) == 6 and row[0] in acquisition.settings()]
     needed, mean, _ = views.tables(data)
-    rows = zip(needed.rows, mean.rows, strict=True)
-    assert [[*b[:5], a[2]] for a, b in rows] == [
-        row for row in lines if len(row) == 6 and row[0] in acquisition.settings()
+    expected = [[*b[:5], a[2]] for a, b in zip(needed.rows, mean.rows, strict=True)]
+    fewer = published.packaged_json("acquisition-overlap.json")
+    needed, mean, _ = views.tables(fewer)
+    chosen = ("random", "highest-reward", "half random, half highest-reward")
+    expected += [
+        [*b[:5], a[2]] for a, b in zip(needed.rows, mean.rows, strict=True) if a[0] != PAIRS and a[1] in chosen
     ]
+    assert shown == expected
+    told = {
+        (c.setting, c.rule) for m in (views.needed, views.over_all) for c in views.compare(fewer, m) if c.told_apart
+    }
+    assert told == {(TRAPS, "half random, half highest-reward")}
     found = views.compare(data, views.over_all)
     better = {(c.setting, c.rule) for c in found if c.told_apart and c.gap.mean < 0}
     rules = ("highest-reward", "half random, half highest-reward")

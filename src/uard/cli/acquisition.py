@@ -21,6 +21,8 @@ class AcquisitionStudy:
     """Number of seeds."""
     first_seed: int = 1000
     """The first of them; even ones below 1000 are for development, all others for what is reported."""
+    overlap: int = 7
+    """Raters per item; 7 are all that a panel may have."""
     extract: str | None = None
     """Write to this file what the report needs."""
     json: str | None = None
@@ -33,11 +35,12 @@ class AcquisitionStudy:
 
         _checks.whole("seeds", self.seeds, low=2, high=10_000)
         _checks.whole("first_seed", self.first_seed, high=10**9)
+        _checks.whole("overlap", self.overlap, low=1, high=1000)
         terminal.check_json(self.json)
         terminal.check_json(self.extract, self.json, field="extract")
         with progress.spinner(console, f"asking simulated raters, {counted(self.seeds, 'seed')}"):
-            result = acquisition.run(range(self.first_seed, self.first_seed + self.seeds))
-        command = f"uard acquisition --seeds {self.seeds} --first-seed {self.first_seed}"
+            result = acquisition.run(range(self.first_seed, self.first_seed + self.seeds), overlap=self.overlap)
+        command = f"uard acquisition --seeds {self.seeds} --first-seed {self.first_seed} --overlap {self.overlap}"
         data = {"command": command, "version": __version__} | result.as_data()
         for target, field in ((self.extract, "extract"), (self.json, "json")):
             if target is not None:

@@ -50,7 +50,7 @@ RULES: dict[str, Any] = {
     "half random, half disputed": {"random": 0.5, "disputed": 0.5},
     "half random, half highest-reward": {"random": 0.5, "highest-reward": 0.5},
 }
-OVERLAP = 7  # raters per item: all that a random panel may have, so that a rule is free to ask them all
+OVERLAP = 7  # raters per item if nothing else is asked for: all that a random panel may have
 ROUND = 10  # answers, after which it is decided anew what is asked
 ANSWERS = (*range(0, 200, 10), *range(200, 400, 20), *range(400, 1201, 50))  # after which regret is measured
 BUDGETS = (100, 200, 400, 800)  # of which the report shows the regret
@@ -290,16 +290,17 @@ def _missed(score: np.ndarray, true: np.ndarray) -> float:
     return float((true.max() - picked) / (true.max() - true.mean()))
 
 
-def follow(case: Case, rule: Any, seed: int) -> np.ndarray:
+def follow(case: Case, rule: Any, seed: int, overlap: int = OVERLAP) -> np.ndarray:
     """Return the regret after each number of ``ANSWERS``; where nothing is left to ask it stays.
 
     Args:
         case: What is asked about.
         rule: As ``Acquisition`` takes it.
         seed: Of the choices.
+        overlap: Raters per item.
     """
     random = np.random.default_rng([seed, 15])
-    acquisition, known = Acquisition(rule, overlap=OVERLAP), case.known
+    acquisition, known = Acquisition(rule, overlap=overlap), case.known
     column = {name: k for k, name in enumerate(known.raters)}
     row = {name: i for i, name in enumerate(known.items)}
     found: list[float] = []
@@ -323,17 +324,19 @@ class Result:
 
     Examples:
         >>> regret = {(TRAPS, RANDOM): np.ones((2, len(ANSWERS)))}
-        >>> Result((1, 3), {TRAPS: ((4, 2), (4, 5))}, {TRAPS: (0.0, 0.5)}, regret).as_data()["settings"][0]["items"]
+        >>> Result((1, 3), 7, {TRAPS: ((4, 2), (4, 5))}, {TRAPS: (0.0, 0.5)}, regret).as_data()["settings"][0]["items"]
         [4, 4]
 
     Attributes:
         seeds: The seeds.
+        overlap: Raters per item.
         sizes: Number of items and of raters for each seed, by setting.
         everything: Regret for each seed where every rater has rated every item, by setting.
         regret: (seeds, answers) by setting and rule.
     """
 
     seeds: tuple[int, ...]
+    overlap: int
     sizes: dict[str, tuple[tuple[int, int], ...]]
     everything: dict[str, tuple[float, ...]]
     regret: dict[tuple[str, str], np.ndarray]
@@ -355,10 +358,10 @@ class Result:
             for setting, sizes in self.sizes.items()
         ]
         numbers = {"answers": list(ANSWERS), "budgets": list(BUDGETS), "target": TARGET, "round": ROUND}
-        return {"seeds": list(self.seeds), **numbers, "settings": found}
+        return {"seeds": list(self.seeds), "overlap": self.overlap, **numbers, "settings": found}
 
 
-def run(seeds: Sequence[int], chosen: Sequence[str] | None = None) -> Result:
+def run(seeds: Sequence[int], chosen: Sequence[str] | None = None, overlap: int = OVERLAP) -> Result:
     """Follow every rule for every seed.
 
     Examples:
@@ -369,6 +372,7 @@ def run(seeds: Sequence[int], chosen: Sequence[str] | None = None) -> Result:
     Args:
         seeds: Seeds >= 0, at least one.
         chosen: Some of ``settings``; all if left out.
+        overlap: Raters per item, >= 1.
 
     Raises:
         InvalidValueError: there is no seed.
@@ -385,6 +389,6 @@ def run(seeds: Sequence[int], chosen: Sequence[str] | None = None) -> Result:
         sizes[setting] = tuple((len(c.known.items), len(c.known.raters)) for c in cases)
         everything[setting] = tuple(c.regret(c.answers) for c in cases)
         for rule in rules(setting):
-            followed = [follow(c, RULES[rule], seed) for c, seed in zip(cases, seeds, strict=True)]
+            followed = [follow(c, RULES[rule], seed, overlap) for c, seed in zip(cases, seeds, strict=True)]
             regret[setting, rule] = np.stack(followed)
-    return Result(tuple(seeds), sizes, everything, regret)
+    return Result(tuple(seeds), overlap, sizes, everything, regret)

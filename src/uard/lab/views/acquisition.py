@@ -116,7 +116,9 @@ def losses(data: Mapping[str, Any]) -> list[str]:
         if worse := [c for c in here if c.told_apart and c.gap.mean > 0]:
             parts.append(f"random is better than {'; '.join(map(_named, worse))}")
         if parts:
-            said.append(f"Who is asked what, {setting}, difference of mean regret [95 %]: {'. And '.join(parts)}.")
+            raters = f"at most {data['overlap']} raters an item"
+            head = f"Who is asked what, {setting}, {raters}, difference of mean regret [95 %]"
+            said.append(f"{head}: {'. And '.join(parts)}.")
     return said
 
 

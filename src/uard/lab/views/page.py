@@ -162,14 +162,12 @@ def _best_of_n() -> Section:
 
 def _acquisition() -> list[Section]:
     """Return the study as it was run first, and again with new and more seeds, which say where random is as good."""
-    named = [published.packaged_json(name) for name in ("acquisition.json", "acquisition-again.json")]
-    runs = [data for data in named if data is not None]
-    if not runs:
-        return []
+    files = [f"acquisition{run}.json" for run in ("", "-again", "-overlap")]
+    runs = [data for data in map(published.packaged_json, files) if data is not None]
     note = "Mean over seeds; the band is the interval of asking at random."
     shown = [
         (
-            f"{len(data['seeds'])} seeds: {data['seeds'][0]} to {data['seeds'][-1]}",
+            f"Seeds {data['seeds'][0]} to {data['seeds'][-1]}, at most {data['overlap']} raters an item",
             picture("Regret against answers, by rule", note, figures.data_uri(acquisition.figure(data))),
             acquisition.losses(data),
             acquisition.tables(data),
@@ -177,7 +175,7 @@ def _acquisition() -> list[Section]:
         for data in runs
     ]
     html = render(HERE, "acquisition.html.j2", runs=shown)
-    losses = tuple(acquisition.losses(runs[-1]))
+    losses = tuple(loss for data in runs[1:] for loss in acquisition.losses(data))
     return [Section("acquisition", "Who is asked what", 92, html, losses=losses)]
 
 
