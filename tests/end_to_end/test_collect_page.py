@@ -198,7 +198,7 @@ def test_keys_that_are_held_down_and_answers_that_are_none(serving, visit):
     page = visit(served, "held").page
     page.wait_for_timeout(350)
     page.keyboard.press("Enter")
-    assert page.get_by_text("Choose something first, or skip.").is_visible()
+    page.get_by_text("Choose something first, or skip.").wait_for()
     page.keyboard.press("5")
     page.keyboard.down("Enter")
     for _ in range(5):
@@ -215,7 +215,7 @@ def test_keys_that_are_held_down_and_answers_that_are_none(serving, visit):
 def test_the_player(serving, visit):
     page = visit(serving("slider"), "player").page
     frame = page.get_by_label("Frame", exact=True)
-    assert page.get_by_role("button", name="Pause").is_visible()
+    page.get_by_role("button", name="Pause").wait_for()
     page.keyboard.press(" ")
     page.get_by_role("button", name="Play", exact=True).wait_for()
     pixels = "() => document.querySelector('canvas').toDataURL()"
@@ -241,7 +241,7 @@ def test_the_player(serving, visit):
 
 def test_whoever_wants_less_motion_starts_clips_herself(serving, visit):
     page = visit(serving("slider"), "calm", reduced_motion="reduce").page
-    assert page.get_by_role("button", name="Play", exact=True).is_visible()
+    page.get_by_role("button", name="Play", exact=True).wait_for()
     assert page.get_by_label("Frame", exact=True).input_value() == "0"
 
 
@@ -385,14 +385,14 @@ def test_a_browser_that_stores_nothing(serving, visit):
 def test_stars_instructions_practice_a_break_and_the_end(serving, visit):
     served = serving("stars")
     page = visit(served, "star", begin=False).page
-    assert page.get_by_text("It is <i>dull</i>.").is_visible()
+    page.get_by_text("It is <i>dull</i>.").wait_for()
     assert page.locator("dialog .completion").inner_text().startswith("<b>bold</b>")
     page.get_by_role("button", name="Begin").click()
-    assert page.get_by_text("Practice", exact=True).is_visible()
+    page.get_by_text("Practice", exact=True).wait_for()
     for key in ("2", "3", "Enter"):
         page.keyboard.press(key)
     page.get_by_role("heading", name="Not quite").wait_for()
-    assert page.get_by_text("It is honest.").is_visible()
+    page.get_by_text("It is honest.").wait_for()
     page.keyboard.press("Enter")
     page.wait_for_function("() => !document.querySelector('dialog[open]')")
     left = {item.id for item in (*TEXTS[2:], LONG)}
@@ -423,6 +423,10 @@ def test_stars_instructions_practice_a_break_and_the_end(serving, visit):
         ("", 3.0, "s u 5 are letters here"),
         ("safe", 0.0, ""),
     ]
+    page.get_by_role("button", name="Undo the last answer").click()
+    page.locator("#work:visible").wait_for()
+    assert page.locator("body").get_attribute("data-item") == rows[-1].item
+    assert [r.supersedes for r in served.wait_for("star", len(rows) + 2)[-2:]] == [r.id for r in rows[-2:]]
 
 
 def test_a_text_with_markup_is_shown_as_it_is(serving, visit):

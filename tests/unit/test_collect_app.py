@@ -276,7 +276,7 @@ def test_a_clock_that_jumps(site):
 def test_a_very_fast_answer_gets_a_note(site):
     browser = site.rater("ann")
     reply = browser.post("/api/answers", json=answer_to(tasks(browser)[0], seconds=0.05))
-    assert "u takes it back" in reply.json()["note"]
+    assert "Undo (u) takes it back" in reply.json()["note"]
 
 
 def test_pairs(made):

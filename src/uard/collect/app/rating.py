@@ -277,7 +277,7 @@ class RaterRoutes:
         seconds = answer.given_at - answer.shown_at
         note = None
         if seconds < QUICK and answer.choice != "skip":
-            note = f"That took {seconds:.1f} seconds. If it was a slip, u takes it back."
+            note = f"That took {seconds:.1f} seconds. If it was a slip, Undo (u) takes it back."
         known = self._site.question.known(item.id, "practice") if answer.kind == "practice" else None
         value = worth(answer, item)
         feedback = None if known is None or value is None else self._feedback(known, value, answer)

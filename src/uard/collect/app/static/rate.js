@@ -8,6 +8,7 @@ const AHEAD = 3; // items that are held ready beside the one that is shown
 const MOST = 20; // that the server hands out at once
 const POLL = 3000; // milliseconds between two looks for something new
 const REST = 300; // milliseconds in which a second click or key press cannot be meant for the new item
+const NOTHING = "Nothing left for now";
 const KEPT = 20; // answers that can be taken back
 
 const config = JSON.parse(document.body.dataset.config);
@@ -98,7 +99,7 @@ function take(reply) {
   tasks.sort((a, b) => (b.kind === "practice") - (a.kind === "practice"));
   if (!current && !waiting && !undoing) {
     if (tasks.length) next();
-    else say("Nothing left for now", "You have rated all there is for you. Thank you! This page looks for more by itself.");
+    else say(NOTHING, "You have rated all there is for you. Thank you! This page looks for more by itself.");
   }
 }
 
@@ -291,6 +292,7 @@ function say(title, text) {
     find("message-title").textContent = title;
     find("message-text").textContent = text;
   }
+  find("undo-last").hidden = title !== NOTHING || !history.length;
   place.message.hidden = false;
   place.work.hidden = true;
   stage.stop();
@@ -402,7 +404,7 @@ function pressed(event) {
     if (key === "Enter" && (event.ctrlKey || event.metaKey)) submit(event);
     return;
   }
-  if (event.ctrlKey || event.metaKey || event.altKey || place.work.hidden && !["h", "?", "i"].includes(key)) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || (place.work.hidden && !["h", "?", "i"].includes(key) && !(key === "u" && !find("undo-last").hidden))) return;
   if (handle(event)) event.preventDefault();
 }
 
@@ -453,6 +455,7 @@ place.form.addEventListener("submit", (event) => { event.preventDefault(); });
 find("submit").addEventListener("click", (event) => { event.preventDefault(); once(submit)(event); });
 find("skip").addEventListener("click", once((event) => submit(event, true)));
 find("undo").addEventListener("click", once(undo));
+find("undo-last").addEventListener("click", once(undo));
 find("show-help").addEventListener("click", () => open("help"));
 find("show-instructions").addEventListener("click", showInstructions);
 rows.forEach((row, k) => {
