@@ -1,8 +1,8 @@
 """The whole loop with ten panels of five: a page, simulated raters, an agent that trains meanwhile.
 
 Each run starts a server, lets the panel's raters answer at it, and trains Q-learning on TrapGrid 8x8 (``examples/
-people_rate.py``). The panels are the first ten of ``random_panel(1100)``, ``random_panel(1101)`` ... that have five
-raters: nothing was tuned on them. Five to ten minutes::
+people_rate.py``). The panels are the first ten of ``random_panel(1200)``, ``random_panel(1201)`` ... that have five
+raters: nothing was tuned on them. Ten minutes::
 
     python benchmarks/people_loop.py --json people.json
 """
@@ -22,7 +22,7 @@ from uard.ratings.panels import composition, random_panel
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "people_rate.py"
 RATERS = 5
-FIRST = 1100  # panels from 1000 to 1065 were looked at when a fault was sought
+FIRST = 1200  # earlier ones were looked at, when a fault was sought and the number of episodes was chosen
 
 
 def panels(number: int) -> list[int]:
@@ -33,7 +33,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--panels", type=int, default=10)
     parser.add_argument("--size", type=int, default=8)
-    parser.add_argument("--episodes", type=int, default=600)
+    parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--json", help="write the numbers to this file")
     chosen = parser.parse_args()
     rows = []
