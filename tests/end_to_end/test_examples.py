@@ -1,5 +1,6 @@
 """Every example is a script that does what its guide says."""
 
+import json
 import re
 import subprocess
 import sys
@@ -49,6 +50,14 @@ def test_a_task_of_verifiers(tmp_path: Path) -> None:
     (topic, _), (filler, _), (hack, believed) = found
     assert float(topic) > float(filler) > float(hack)
     assert int(believed) < 10
+
+
+def test_people_rate_while_an_agent_trains(tmp_path: Path) -> None:
+    """From an empty store to an agent that avoids the traps and reaches the goal, by raters at a real page."""
+    numbers = json.loads(run("people_rate.py", tmp_path, "--json", "--episodes", "800"))
+    assert numbers["ratings"] > 300
+    assert numbers["goal_rate"] > 0.9
+    assert numbers["hacks"] < 3  # without ratings it hacks 17 times
 
 
 @pytest.mark.parametrize("name", sorted(p.name for p in EXAMPLES.glob("*.py")))
