@@ -46,7 +46,7 @@ def test_who_does_not_answer_skips(tmp_path):
 
 
 def test_an_address_that_is_none(tmp_path):
-    with pytest.raises(InvalidValueError, match="url = '127.0.0.1:80'"):
+    with pytest.raises(InvalidValueError, match=r"url = '127\.0\.0\.1:80'"):
         Visitor("127.0.0.1:80")
     with pytest.raises(OSError, match="refused"):
         Visitor("http://127.0.0.1:1", patience=0.0).ask("/api/next", {})
