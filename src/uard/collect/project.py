@@ -67,7 +67,8 @@ class Question:
         instructions: Plain text that is shown first, and on demand.
         overlap: Raters per item.
         repeats: Share of questions that a rater has answered before, in [0, 1).
-        acquisition: Who is asked what: a rule's name, or names with weights (``uard.collect.acquisition``).
+        acquisition: Who is asked what: a rule's name, or names with weights (``uard.collect.acquisition``). The default
+            is what did better than chance on grids and clips (``uard acquisition``).
         break_after: Answers after which a break is proposed; 0 for never.
         show_reward: Whether raters see what the environment paid.
         practice: Items that are shown first, with feedback.
@@ -86,7 +87,7 @@ class Question:
     instructions: str = "Judge what you see, not what you expect. There is no hurry, and u takes an answer back."
     overlap: int = 3
     repeats: float = 0.05
-    acquisition: str | Mapping[str, float] = "random"
+    acquisition: str | Mapping[str, float] = field(default_factory=lambda: {"random": 0.5, "highest-reward": 0.5})
     break_after: int = 50
     show_reward: bool = False
     practice: tuple[Known, ...] = ()
