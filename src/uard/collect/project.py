@@ -68,7 +68,8 @@ class Question:
         overlap: Raters per item.
         repeats: Share of questions that a rater has answered before, in [0, 1).
         acquisition: Who is asked what: a rule's name, or names with weights (``uard.collect.acquisition``). The default
-            is what did better than chance on grids and clips (``uard acquisition``).
+            does better than chance on grids and clips where all raters rate an item; with three of them little of that
+            is left (``uard acquisition``).
         break_after: Answers after which a break is proposed; 0 for never.
         show_reward: Whether raters see what the environment paid.
         practice: Items that are shown first, with feedback.
