@@ -119,6 +119,20 @@ def test_no_cell_of_a_csv_file_is_a_formula():
     assert (row["rater"], row["comment"], row["rating"]) == ("'=1+1", "'@SUM(A1)", "0.5")
 
 
+def test_thumbs_are_ratings_with_what_they_are_worth(tmp_path):
+    said = Answers((Answer("t1", "x", "ann", 2.0, "up"), Answer("t2", "y", "ann", -1.0, "down")))
+    assert said.to_log(lambda _: None).ratings.tolist() == [[2.0], [-1.0]]
+    file = tmp_path / "thumbs.csv"
+    file.write_bytes(export.write(said, ITEMS, "csv"))
+    assert readers.read(file).ratings.tolist() == [[2.0], [-1.0]]
+    assert export.read_record(export.write(said, {}, "record")) == said
+
+
+def test_a_record_keeps_every_character_of_a_comment():
+    said = Answers((rated("c1", "x", "ann", 0.5, comment="one\u2028two\u0085three\x0bfour\r\nfive"),))
+    assert export.read_record(export.write(said, {}, "record")) == said
+
+
 def test_nothing_to_export_is_an_empty_table():
     assert export.write(Answers(), {}, "csv").count(b"\n") == 1
     assert export.write(Answers(), {}, "jsonl") == b""
@@ -135,7 +149,7 @@ def test_nothing_to_export_is_an_empty_table():
         ({"value": None}, "value = None"),
         ({"choice": "left", "value": None}, "left, right"),
         ({"choice": "best", "value": None}, "choice = 'best'"),
-        ({"choice": "skip"}, "None where there is a choice"),
+        ({"choice": "skip"}, "None where the choice is 'skip'"),
         ({"kind": "test"}, "kind = 'test'"),
         ({"given_at": -1.0}, "given_at"),
         ({"comment": "x" * 2001}, "comment"),

@@ -62,7 +62,8 @@ def read_record(data: bytes) -> Answers:
         InvalidValueError: a line is none of them.
     """
     rows: list[Answer] = []
-    for number, line in enumerate(data.decode().splitlines()):
+    lines = data.decode().split("\n")  # a comment may hold what else ends a line of text
+    for number, line in enumerate(lines[:-1] if lines[-1] == "" else lines):
         try:
             rows.append(answer_of(json.loads(line)))
         except json.JSONDecodeError:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 CHOICES = ("left", "right", "tie", "cannot tell", "up", "down", "skip")
 KINDS = ("rating", "repeat", "gold", "practice")
 PAIRED = ("left", "right", "tie")
+THUMBS = ("up", "down")
 LONGEST = 200  # characters of a name
 LONGEST_COMMENT = 2000
 
@@ -40,7 +41,8 @@ class Answer:
         id: Unique; made by whoever gives the answer, so that sending it twice stores it once.
         item: What was rated.
         rater: Who rated it.
-        value: In the scale's unit, finite; None for a choice, for "skip", and for an answer that only takes one back.
+        value: In the scale's unit, finite; what thumbs up or down are worth; None for other choices, and for an answer
+            that only takes one back.
         choice: One of ``CHOICES``, or None.
         attribute: What about the item was rated; empty for the question itself.
         scale: What could be answered, such as ``slider -1..1``, ``stars 5``, ``thumbs`` or ``pair``.
@@ -84,8 +86,8 @@ class Answer:
             _checks.number("value", self.value, low=-_checks.LARGEST, high=_checks.LARGEST)
         if self.choice is not None:
             _checks.choose("choice", self.choice, CHOICES)
-            if self.value is not None:
-                raise _checks.InvalidValueError("value", self.value, "None where there is a choice")
+            if self.value is not None and self.choice not in THUMBS:
+                raise _checks.InvalidValueError("value", self.value, f"None where the choice is {self.choice!r}")
         if self.value is None and self.choice is None and self.supersedes is None:
             raise _checks.InvalidValueError("value", None, "a number, unless there is a choice or something taken back")
         if self.choice in PAIRED and (self.left is None or self.right is None or self.left == self.right):
@@ -161,7 +163,7 @@ class Answers:
         """Return the ratings of items as a log: a row per item, a column per rater.
 
         A rater's latest answer about an item is the rating; earlier ones are ``repeats``. Practice does not count, and
-        neither do choices.
+        neither do choices without a value.
 
         Examples:
             >>> rows = Answer("a1", "x", "ann", 1.0), Answer("a2", "x", "bob", 0.5), Answer("a3", "y", "bob", 0.0)

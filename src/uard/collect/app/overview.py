@@ -144,10 +144,10 @@ def worth(answer: Answer, item: Item | None) -> float | None:
         answer: What was said.
         item: Of what.
     """
-    if answer.value is not None:
-        return answer.value
     if answer.choice in ("up", "down"):
         return float(answer.choice == "up")
+    if answer.value is not None:
+        return answer.value
     if answer.choice == "tie":
         return 0.5
     if answer.choice in ("left", "right") and item is not None and item.kind == "pair":

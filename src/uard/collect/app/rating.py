@@ -242,7 +242,8 @@ class RaterRoutes:
                 raise HTTPException(400, f"choice = {choice!r}: must be one of {', '.join(allowed)}, without values.")
             if (item.kind == "pair") != (question.kind == "pairs"):
                 raise HTTPException(400, f"This question is not asked about a {item.kind}.")
-            return [("", None, str(choice))]
+            thumbs = {"up": question.high, "down": question.low} if question.kind == "thumbs" else {}
+            return [("", thumbs.get(str(choice)), str(choice))]
         names = ("", *question.attributes)
         if question.kind in _CHOICES or not isinstance(values, dict) or set(cast("Any", values)) != set(names):
             wanted = "a choice" if question.kind in _CHOICES else f"values for {', '.join(map(repr, names))}"
