@@ -1,5 +1,7 @@
 """What a training run and its raters give each other."""
 
+import io
+
 import gymnasium
 import numpy as np
 import pytest
@@ -7,9 +9,9 @@ import pytest
 import uard.envs  # noqa: F401 - registers the environments
 from uard._checks import InvalidValueError
 from uard.adapters.gymnasium import ReliabilityWrapper
-from uard.collect import Project, clip_item, recorder
+from uard.collect import Project, Question, clip_item, recorder, sheets
 from uard.collect.clip_model import FEWEST, ClipModel, RatedClip
-from uard.collect.loop import StoreRatings
+from uard.collect.loop import StoreRatings, UnusableClipWarning
 from uard.collect.recorder import ClipRecorder
 from uard.ratings.table import Answer
 
@@ -78,6 +80,81 @@ def test_the_store_is_looked_into_no_more_often_than_asked(project):
     assert ask(ratings, 1, 3) == [-1.0]
 
 
+def test_an_answer_that_is_corrected_in_time_is_not_handed_on(project):
+    x = step(1, 3)
+    ratings = StoreRatings(project, *NUMBERED, poll=0.0)
+    with project.store() as store:
+        store.add_items([x])
+        store.invite("ann")
+        store.put([Answer("a1", x.id, "ann", 1.0)])
+        ratings.refresh()
+        store.put([Answer("a2", x.id, "ann", -1.0, supersedes="a1")])
+        assert ask(ratings, 1, 3) == [-1.0]
+        assert np.isnan(ask(ratings, 1, 3)).all()
+
+
+def test_the_model_forgets_what_was_taken_back(project):
+    random = np.random.default_rng(0)
+    ratings = StoreRatings(project, *SMOOTH, poll=0.0)
+    items = []
+    for clip in lying(random, 2 * FEWEST):
+        file = io.BytesIO()
+        np.savez(file, observations=clip.observations, actions=clip.actions)
+        name = project.keep(file.getvalue(), "npz")
+        items.append(clip_item("0" * 64 + ".webp", 9, 3, (8, 8), data=name, reward=1.0))
+    with project.store() as store:
+        store.add_items(items)
+        store.invite("ann")
+        for i, item in enumerate(items):
+            store.put([Answer(f"a{i}", item.id, "ann", 0.0)])
+        assert np.isfinite(ratings(np.zeros((2, 2)), np.zeros((2, 1)), None, np.ones(2))).all()
+        for i, item in enumerate(items[: FEWEST + 1]):
+            store.put([Answer(f"b{i}", item.id, "ann", supersedes=f"a{i}")])
+        assert np.isnan(ratings(np.zeros((2, 2)), np.zeros((2, 1)), None, np.ones(2))).all()
+
+
+def test_clips_that_say_nothing_to_a_run_are_named_and_do_not_end_it(project):
+    missing = clip_item("0" * 64 + ".webp", 9, 3, (8, 8), data="0" * 64 + ".npz", reward=1.0)
+    with project.store() as store:
+        store.add_items([missing])
+        store.invite("ann")
+        store.put([Answer("a1", missing.id, "ann", 0.0)])
+    with pytest.warns(UnusableClipWarning, match="cannot be read"):
+        StoreRatings(project, *SMOOTH)(np.zeros((2, 2)), np.zeros((2, 1)), None, np.ones(2))
+    with pytest.warns(UnusableClipWarning, match="cannot be read"):
+        StoreRatings(project, *NUMBERED)(np.zeros(1, int), np.zeros(1, int), None, np.ones(1))
+
+
+def test_clips_of_several_steps_belong_to_no_state_action(project):
+    file = io.BytesIO()
+    np.savez(file, observations=np.zeros(3, int), actions=np.zeros(2, int))
+    long = clip_item("0" * 64 + ".webp", 3, 3, (8, 8), data=project.keep(file.getvalue(), "npz"), reward=1.0)
+    with project.store() as store:
+        store.add_items([long])
+        store.invite("ann")
+        store.put([Answer("a1", long.id, "ann", 0.0)])
+    with pytest.warns(UnusableClipWarning, match="with length 1"):
+        StoreRatings(project, *NUMBERED)(np.zeros(1, int), np.zeros(1, int), None, np.ones(1))
+
+
+def test_a_key_of_ones_own_finds_its_ratings(project):
+    file = io.BytesIO()
+    np.savez(file, observations=np.array([[0.5, 0.1], [0.5, 0.2]]), actions=np.array([[1.0]]))
+    near = clip_item("0" * 64 + ".webp", 2, 2, (8, 8), data=project.keep(file.getvalue(), "npz"), reward=1.0)
+    with project.store() as store:
+        store.add_items([near])
+        store.invite("ann")
+        store.put([Answer("a1", near.id, "ann", 0.25)])
+    ratings = StoreRatings(project, *SMOOTH, key=lambda observation, action: round(float(observation[0]), 1))
+    assert ratings(np.array([[0.51, 0.9]]), np.zeros((1, 1)), None, np.ones(1)).tolist() == [[0.25]]
+
+
+def test_pairs_give_no_ratings_of_steps(tmp_path):
+    pairs = Project.create(tmp_path / "pairs", Question(kind="pairs"))
+    with pytest.raises(InvalidValueError, match="of pairs nothing is known by step"):
+        StoreRatings(pairs, *NUMBERED)
+
+
 def lying(random, count, length=8):
     """Clips in whose right half the reward is 1 too high; ann says so, bob repeats the reward, cyd is noisy."""
     clips = []
@@ -111,6 +188,19 @@ def test_nothing_is_said_of_what_is_far_from_every_clip():
     near = model(np.full((50, 2), 0.5) + np.random.default_rng(1).normal(0, 0.05, (50, 2)), np.zeros((50, 1)))
     far = model(np.random.default_rng(1).uniform(-10, -6, (50, 2)) * [1, -1], np.ones((50, 1)))
     assert np.isfinite(near[:, 0]).mean() > np.isfinite(far[:, 0]).mean() + 0.3
+
+
+def test_raters_who_agree_with_the_reward_say_nothing_of_what_they_did_not_see():
+    random = np.random.default_rng(0)
+    clips = [
+        RatedClip(random.uniform(-1, 0, (8, 2)), np.zeros((8, 1)), r, np.array([r])) for r in np.linspace(0, 1, 60)
+    ]
+    model = ClipModel(*SMOOTH)
+    model.fit(clips)
+    seen = model(random.uniform(-0.8, -0.2, (50, 2)), np.zeros((50, 1)))
+    unseen = model(random.uniform(0.8, 1.0, (50, 2)), np.ones((50, 1)))
+    assert np.isfinite(seen).mean() > np.isfinite(unseen).mean() + 0.3
+    assert np.nanmean(np.abs(seen)) < 0.1
 
 
 def test_a_rater_is_heard_after_some_clips_only():
@@ -204,6 +294,60 @@ def test_the_filter_of_a_gymnasium_run_hears_the_store(project):
     env.reset(seed=0)
     reward = env.step(1)[1]
     assert reward < -0.5  # two raters say so, the environment paid -0.1
+    env.close()
+
+
+class Careless(gymnasium.Env):
+    """Draws into one picture and one observation again and again; its pictures and numbers may go wrong."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    render_mode = "rgb_array"
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, fails=""):
+        self.fails, self.time = fails, 0
+        self.seen, self.drawn = np.zeros(1, np.float32), np.zeros((160, 160, 3), np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        self.time, self.seen[:] = 0, 0.0
+        return self.seen, {}
+
+    def step(self, action):
+        self.time += 1
+        self.seen[:] = np.nan if self.fails == "number" and self.time > 2 else self.time
+        return self.seen, 1.0, False, self.time == 6, {}
+
+    def render(self):
+        if self.fails == "picture" and self.time > 2:
+            return np.zeros((80, 160, 3), np.uint8)
+        self.drawn[:] = 20 * self.time
+        return self.drawn
+
+
+def test_an_environment_may_use_its_arrays_again(project):
+    env = ClipRecorder(Careless(), project, share=1.0, length=5)
+    env.reset()
+    for _ in range(6):
+        env.step(0)
+    env.close()
+    with project.store() as store:
+        item = store.items()[0][0]
+    with np.load(project.media(item.content["data"])) as arrays:
+        times = arrays["observations"].ravel()
+    assert (np.diff(times) == 1).all()
+    sheet = project.media(item.content["sheet"]).read_bytes()
+    frames = sheets.frames_of(sheet, item.content["frames"], item.content["columns"], (160, 160))
+    assert frames[:, 0, 0, 0].tolist() == (20 * times).tolist()
+
+
+@pytest.mark.parametrize("fails", ["picture", "number"])
+def test_a_clip_that_cannot_be_recorded_does_not_end_a_training(project, fails):
+    env = ClipRecorder(Careless(fails), project, share=1.0, length=5)
+    env.reset()
+    with pytest.warns(UnusableClipWarning, match="a clip was not recorded"):
+        seen = [env.step(0)[4] for _ in range(6)]
+    assert len(seen) == 6
     env.close()
 
 

@@ -72,8 +72,8 @@ class ClipModel:
             members: Fits per rater, in [2, 64].
             features: Random features of each member, in [1, 4096].
             ridge: Penalty > 0, in clips: how many it takes before data outweigh the prior.
-            doubt: Where the members' deviation exceeds this share of the usual gap (root mean square over clips and
-                raters), nothing is said for a rater, in (0, 1].
+            doubt: Where the members' deviation exceeds this share of what a gap may be (the root mean square of gaps,
+                or the deviation of rewards if that is more), nothing is said for a rater, in (0, 1].
             seed: Of features, priors and bootstraps, >= 0.
 
         Raises:
@@ -88,7 +88,7 @@ class ClipModel:
         self._prior = self._random.normal(0.0, 1.0, (members, features))
         self._ridge, self._doubt = ridge, doubt
         self._weights: list[Float[np.ndarray, "N F"] | None] = []
-        self._usual = 0.0  # gap
+        self._usual = 0.0  # what a gap may be
 
     def fit(self, clips: Sequence[RatedClip]) -> None:
         """Fit all raters anew to all clips that are rated.
@@ -106,7 +106,7 @@ class ClipModel:
         if not clips:
             return
         z = np.stack([self._features(c.observations, c.actions).mean(1) for c in clips], axis=1)
-        self._usual, self._weights = float(np.sqrt(np.nanmean(gaps**2))), []
+        self._usual, self._weights = _usual(gaps, np.array([c.reward for c in clips])), []
         for k in range(raters):
             heard = np.isfinite(gaps[:, k])
             enough = int(heard.sum()) >= FEWEST
@@ -138,3 +138,9 @@ class ClipModel:
             sure = said.std(0) <= self._doubt * self._usual
             out[:, k] = np.where(sure, said.mean(0), np.nan)
         return out
+
+
+def _usual(gaps: Float[np.ndarray, "n K"], rewards: Float[np.ndarray, " n"]) -> float:
+    """Return what a gap may be, in reward units; > 0, for raters who agree so far may differ where they saw nothing."""
+    found = max(float(np.sqrt(np.nanmean(gaps**2))), float(rewards.std()))
+    return found or float(np.abs(rewards).max()) or 1.0

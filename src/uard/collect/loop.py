@@ -8,6 +8,7 @@ run itself before the raters.
 from __future__ import annotations
 
 import time
+import warnings
 from collections import defaultdict, deque
 from collections.abc import Callable, Hashable
 from pathlib import Path
@@ -29,12 +30,17 @@ if TYPE_CHECKING:
 MORE = 1.1  # times as many ratings: the model of clips is fitted again
 
 
+class UnusableClipWarning(UserWarning):
+    """Raters have rated clips that say nothing to this training."""
+
+
 class StoreRatings:
     """What raters have said of a run's steps so far (an adapter's ``ratings=``). Changed in place.
 
-    Where states and actions are numbered, a rating of a step is handed on when its state-action comes again, once:
-    the adapter remembers it under the same key. Elsewhere a ``ClipModel`` of each rater says what she would say of a
-    step, and nothing where too little is known. An answer that is taken back after it was handed on stays handed on.
+    Where states and actions are numbered, or there is a ``key``, a rating of a clip of one step is handed on when its
+    state-action comes again, once: the adapter remembers it under the same key. An answer that is corrected or taken
+    back before that is not handed on; afterwards it stays. Elsewhere a ``ClipModel`` of each rater says what she would
+    say of a step, and nothing where too little is known.
 
     Examples:
         >>> import tempfile
@@ -79,22 +85,30 @@ class StoreRatings:
             clock: Seconds that never go back.
 
         Raises:
-            InvalidValueError: there is no such project, or a space is none that the model can work with.
+            InvalidValueError: there is no such project, its raters give no numbers, or a space is none that the model
+                can work with.
             StoreError: its store cannot be opened.
         """
         _checks.number("poll", poll, low=0)
         self._project = project if isinstance(project, Project) else Project.open(project)
+        if self._project.question.kind == "pairs":
+            allowed = "one whose raters give numbers (kind slider, stars or thumbs): of pairs nothing is known by step"
+            raise _checks.InvalidValueError("project", str(self._project.folder), allowed)
         self._store = self._project.store()
-        self._key = key or natural_key(observation_space, action_space)
+        self._natural = natural_key(observation_space, action_space)
+        self._key = key or self._natural
         self._steps = Steps(key=self._key)
         self._model = model or (None if self._key is not None else ClipModel(observation_space, action_space))
         self._poll, self._clock, self._due = poll, clock, -np.inf
         self._items: dict[str, Item] = {}
         self._places = [0, 0]  # of the last item and the last answer that were read
         self._columns: dict[str, int] = {}
-        self._waiting: dict[Hashable, dict[int, deque[float]]] = defaultdict(lambda: defaultdict(deque))
-        self._clips: dict[str, RatedClip] = {}
-        self._fitted = 0
+        self._waiting: dict[Hashable, dict[int, deque[Answer]]] = defaultdict(lambda: defaultdict(deque))
+        self._gone: set[str] = set()  # names of answers in whose place others are
+        self._said: dict[str, Answer] = {}  # that stand, for the model
+        self._clips: dict[str, RatedClip | None] = {}
+        self._keys: dict[str, Hashable | None] = {}
+        self._fitted, self._changed = 0, False
         self.heard = 0
 
     def close(self) -> None:
@@ -121,10 +135,14 @@ class StoreRatings:
         out = np.full((len(rewards), max(len(self._columns), 1)), np.nan)
         keys = self._steps.keys(observations, actions, len(rewards)) if self._waiting else None
         for i, key in enumerate(keys or ()):
-            for column, values in self._waiting.pop(key, {}).items():
-                out[i, column] = values.popleft()
-                if values:
-                    self._waiting[key][column] = values
+            for column, answers in self._waiting.pop(key, {}).items():
+                while answers:
+                    answer = answers.popleft()
+                    if answer.id not in self._gone and answer.value is not None:
+                        out[i, column] = answer.value
+                        break
+                if answers:
+                    self._waiting[key][column] = answers
         return out
 
     def refresh(self) -> int:
@@ -138,39 +156,76 @@ class StoreRatings:
         for rater in self._store.raters():
             self._columns.setdefault(rater.name, len(self._columns))
         answers, self._places[1] = self._store.answers(self._places[1])
+        self._gone |= {a.supersedes for a in answers if a.supersedes is not None}
+        for name in self._gone & self._said.keys():
+            del self._said[name]
+            self._changed = True
         new = [a for a in answers.standing() if a.value is not None and not a.attribute and a.kind != "practice"]
         for answer in new:
             self._take(answer, self._items.get(answer.item))
         self.heard += len(new)
-        if self._model is not None and self.heard > MORE * self._fitted:
-            self._fitted = self.heard
-            self._model.fit(list(self._clips.values()))
+        if self._model is not None and (self._changed or self.heard > MORE * self._fitted):
+            self._fitted, self._changed = self.heard, False
+            self._model.fit(self._rated())
         return len(new)
 
     def _take(self, answer: Answer, item: Item | None) -> None:
-        assert answer.value is not None
-        column = self._columns[answer.rater]
         if item is None or item.kind != "clip":
             return
-        if self._key is not None:
-            key = item.content.get("key")
-            if key is not None:
-                self._waiting[_hashable(key)][column].append(answer.value)
-        elif item.content.get("data") and item.reward is not None:
-            known = self._clips.get(item.id) or self._read(item)
-            ratings = np.full(len(self._columns), np.nan)
-            ratings[: len(known.ratings)] = known.ratings
-            ratings[column] = answer.value
-            self._clips[item.id] = known._replace(ratings=ratings)
+        if self._key is None:
+            self._said[answer.id] = answer
+            return
+        if item.id not in self._keys:
+            self._keys[item.id] = self._key_of(item)
+        key = self._keys[item.id]
+        if key is not None:
+            self._waiting[key][self._columns[answer.rater]].append(answer)
 
-    def _read(self, item: Item) -> RatedClip:
+    def _key_of(self, item: Item) -> Hashable | None:
+        """Return the key of a clip's only step; None, with a warning, if there is none."""
+        if self._key is self._natural and item.content.get("key") is not None:
+            return _hashable(item.content["key"])
+        clip = self._read(item)
+        if clip is None:
+            return None
+        if len(clip.actions) != 1:
+            _warn("clips of several steps were rated, and a rating belongs to one: record them with length 1")
+            return None
+        found = self._steps.keys(clip.observations, clip.actions, 1)
+        return None if found is None else found[0]
+
+    def _rated(self) -> list[RatedClip]:
+        """Return the clips that can be read, with the latest rating of each rater."""
+        ratings: dict[str, Float[np.ndarray, " K"]] = {}
+        for answer in self._said.values():
+            row = ratings.setdefault(answer.item, np.full(len(self._columns), np.nan))
+            row[self._columns[answer.rater]] = answer.value
+        for name in ratings.keys() - self._clips.keys():
+            self._clips[name] = self._read(self._items[name])
+        clips = [(self._clips[name], row) for name, row in ratings.items()]
+        return [clip._replace(ratings=row) for clip, row in clips if clip is not None]
+
+    def _read(self, item: Item) -> RatedClip | None:
+        """Return what was recorded with a clip; None, with a warning, if that is missing or no finite numbers."""
+        if not item.content.get("data") or item.reward is None:
+            _warn("clips without observations, actions or rewards were rated")
+            return None
         path = self._project.media(str(item.content["data"]))
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 observations, actions = arrays["observations"], arrays["actions"]
         except (OSError, ValueError, KeyError) as error:
-            raise _checks.InvalidValueError(str(path), str(error), "the file that was recorded with the clip") from None
-        return RatedClip(observations[: len(actions)], actions, float(item.reward or 0.0), np.zeros(0))
+            _warn(f"{path} cannot be read ({error})")
+            return None
+        if not (np.isfinite(observations).all() and np.isfinite(actions).all()):
+            _warn(f"{path} holds an observation or an action that is no finite number")
+            return None
+        return RatedClip(observations[: len(actions)], actions, float(item.reward), np.zeros(0))
+
+
+def _warn(why: str) -> None:
+    """Say why ratings go unheard; a training is not ended for that."""
+    warnings.warn(f"some ratings are not used: {why}", UnusableClipWarning, stacklevel=4)
 
 
 def _hashable(key: Any) -> Hashable:

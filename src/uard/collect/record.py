@@ -248,7 +248,7 @@ class _Recorder:
     def _frame(self) -> np.ndarray:
         found = drawing.picture(self._env, self._shape)
         self._shape = found.shape
-        return sheets.fitted(found)
+        return np.array(sheets.fitted(found))  # copied: an environment may draw into it again
 
     def _clip(self) -> Clip:
         frames, observations = [self._frame()], [as_array(self._env, "observation_space", self._observation)]
@@ -278,13 +278,15 @@ def as_array(env: gymnasium.Env[Any, Any], field: str, value: Any) -> np.ndarray
     space: Any = getattr(env, field)
     spaces = gymnasium.spaces
     if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
-        found = np.asarray(value)
+        found = np.array(value)  # copied: an environment may write into it later
     elif space.is_np_flattenable:
-        found = np.asarray(cast("Any", gymnasium.spaces.flatten(space, value)))
+        found = np.array(cast("Any", gymnasium.spaces.flatten(space, value)))
     else:
         raise _checks.InvalidValueError(field, space, "a space of arrays, or of such as can be flattened to one")
     if found.dtype.kind not in "biuf":
         raise _checks.InvalidValueError(field, cast("object", value), f"of numbers, as {space} says")
+    if not np.isfinite(found).all():
+        raise _checks.InvalidValueError(field, cast("object", value), "of finite numbers")
     return found
 
 

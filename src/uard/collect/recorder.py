@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +16,10 @@ from uard import _checks
 from uard.adapters.steps import natural_key
 from uard.collect import drawing, sheets
 from uard.collect.items import Item
+from uard.collect.loop import UnusableClipWarning
 from uard.collect.project import Project
 from uard.collect.record import LONGEST, Clip, as_array, keep_clip
-from uard.collect.store import Request
+from uard.collect.store import Request, StoreError
 
 EACH = 16  # clips that are put into the store in one go
 SOON = 0.5  # seconds after which fewer are, between two episodes: a rare step must not wait for others
@@ -100,33 +103,31 @@ class ClipRecorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         self._once_more: list[str] = []
         self._clip: _Clip | None = None
         self._observation: Any = None
-        self._simple, self._flushed = False, 0.0
+        self._shape: tuple[int, ...] | None = None  # of the environment's pictures
+        self._flushed = 0.0
         self.recorded = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; a clip that was not finished ends where the episode was left."""
-        self._finish()
+        self._safely(self._finish)
         if time.monotonic() - self._flushed > SOON:
-            self._flush()
+            self._safely(self._flush)
         self._observation, info = super().reset(seed=seed, options=options)
-        if not self._simple:
+        if self._shape is None:  # what cannot be drawn at all is known now
             drawing.find_library(self.env)
             drawing.simplify(self.env)
-            self._simple = True
+            self._frame()
+            as_array(self.env, "observation_space", self._observation)
         return self._observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Act, and record the step if it is one of those."""
         if self._clip is None and self.recorded < self._most and self._random.random() < self._chance:
-            self._begin(action)
+            self._safely(lambda: self._begin(action))
         observation, reward, terminated, truncated, info = super().step(action)
-        if self._clip is not None:
-            self._clip.actions.append(as_array(self.env, "action_space", action))
-            self._clip.rewards.append(float(reward))
-            self._clip.frames.append(self._frame())
-            self._clip.observations.append(as_array(self.env, "observation_space", observation))
-            if len(self._clip.actions) == self._length or terminated or truncated:
-                self._finish()
+        if (clip := self._clip) is not None:
+            over = bool(terminated or truncated)
+            self._safely(lambda: self._add(clip, action, float(reward), observation, over))
         self._observation = observation
         return observation, reward, terminated, truncated, info
 
@@ -136,6 +137,23 @@ class ClipRecorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
         self._flush()
         self._store.close()
         super().close()
+
+    def _safely(self, record: Callable[[], None]) -> None:
+        """Record; what cannot be recorded is left out, and said once: a training is not ended for that."""
+        try:
+            record()
+        except (_checks.InvalidValueError, StoreError, OSError) as error:
+            self._clip = None
+            warnings.warn(f"a clip was not recorded: {error}", UnusableClipWarning, stacklevel=3)
+
+    def _add(self, clip: _Clip, action: Any, reward: float, observation: Any, over: bool) -> None:
+        _checks.number("reward", reward)
+        clip.actions.append(as_array(self.env, "action_space", action))
+        clip.rewards.append(reward)
+        clip.frames.append(self._frame())
+        clip.observations.append(as_array(self.env, "observation_space", observation))
+        if len(clip.actions) == self._length or over:
+            self._finish()
 
     def _begin(self, action: Any) -> None:
         key = None
@@ -154,7 +172,9 @@ class ClipRecorder(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Record
                 self._flush()
 
     def _frame(self) -> np.ndarray:
-        return sheets.fitted(drawing.picture(self.env))
+        found = drawing.picture(self.env, self._shape)
+        self._shape = found.shape
+        return np.array(sheets.fitted(found))  # copied: an environment may draw into it again
 
     def _finish(self) -> None:
         clip, self._clip = self._clip, None
