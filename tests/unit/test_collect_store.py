@@ -166,6 +166,95 @@ def test_an_answer_that_is_taken_back_stays_and_its_item_comes_again(store):
         store.put([Answer("u3", X, "bob", supersedes="u1")])
 
 
+def test_of_several_answers_to_one_lease_the_last_stands_alone(store):
+    store.ask([Request(X), Request(Y, "ann", "gold")])
+    one, other = store.lease("ann", 2)
+    lease = one if one.item.id == X else other
+    wrong = []
+
+    def tell(k):
+        try:
+            with SQLiteStore(store.path) as own:
+                own.put([said(f"a{k}", value=float(k), kind="repeat"), said(f"a{k}.1", attribute="safe")], lease.id)
+        except Exception as error:
+            wrong.append(error)
+
+    threads = [threading.Thread(target=tell, args=(k,)) for k in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+    answers, _ = store.answers()
+    assert [(a.attribute, a.kind) for a in answers.standing()] == [("", "rating"), ("safe", "rating")]
+    assert len({a.supersedes for a in answers}) == 11, "each takes the place of the one before it"
+    store.put([Answer("s1", X, "ann", choice="skip")], lease.id)
+    answers, _ = store.answers()
+    assert [a.id for a in answers.standing()] == ["s1"], "nothing is said any more of what was rated beside it"
+    again = store.put([Answer("s1", X, "ann", choice="skip")], lease.id)
+    assert again[0].supersedes is not None
+    assert store.answers()[0] == answers
+    store.put([Answer("u1", X, "ann", supersedes="s1")])
+    assert lease.id in [x.id for x in store.lease("ann", 2)], "what is taken back comes again, whichever tab said it"
+    store.put([said("b1")], lease.id)
+    assert [a.id for a in store.answers()[0].standing()] == ["b1"]
+
+
+def test_a_lease_is_known_for_ever_and_to_its_rater_only(store, clock):
+    pair = pair_item(X, Y)
+    store.add_items([pair])
+    store.ask([Request(pair.id)])
+    (first,) = store.lease("ann")
+    clock.now += 2 * LEASE_SECONDS
+    (second,) = store.lease("bob")
+    with SQLiteStore(store.path) as opened:
+        found = opened.leased(first.id)
+        assert (found.rater, found.item, found.left, found.kind) == ("ann", pair, first.left, "rating")
+        assert opened.leased(second.id) == second
+        assert opened.leased("never") is None
+    for name, lease in (("ann", second.id), ("ann", "never")):
+        with pytest.raises(ConflictError, match="was not shown this item"):
+            store.put([Answer("p1", pair.id, name, choice="cannot tell")], lease)
+    with pytest.raises(ConflictError, match="was not shown this item"):
+        store.put([said("p1")], first.id)
+    assert len(store.answers()[0]) == 0
+
+
+def test_a_store_has_an_identity_that_a_copy_keeps(store, tmp_path):
+    with SQLiteStore(tmp_path / "other.sqlite") as other, SQLiteStore(store.path) as again:
+        assert store.identity == again.identity != other.identity
+    store.close()
+    (tmp_path / "copy.sqlite").write_bytes(store.path.read_bytes())
+    with SQLiteStore(tmp_path / "copy.sqlite") as copy:
+        assert copy.identity == store.identity
+
+
+def test_sessions_end_when_the_owner_says_so(store):
+    store.enter(store.invite("ann"))
+    store.enter(store.invite("bob"))
+    store.enter(store.invite("ann", end_sessions=True))
+    assert [len(r.sessions) for r in store.raters()] == [1, 1]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such modes")
+def test_the_file_is_for_its_owner_only(store):
+    store.put([said("a1")])
+    for file in store.path.parent.iterdir():
+        assert file.stat().st_mode & 0o077 == 0, file
+
+
+@pytest.mark.parametrize("content", ["{", "[]", "null", '{"kind": "picture"}', "[" * 100_000])
+def test_an_item_that_is_none_is_named(store, content):
+    with sqlite3.connect(store.path) as db:
+        db.execute("UPDATE items SET content = ? WHERE seq = 2", (content,))
+    db.close()
+    with pytest.raises(StoreError, match="is damaged: what stands there as item 2 is none"):
+        store.items()
+    store.ask([Request(Y)])
+    with pytest.raises(StoreError, match="is damaged"):
+        store.lease("ann")
+
+
 def test_what_the_owner_takes_back_is_not_asked_again(store):
     store.ask([Request(X)])
     (lease,) = store.lease("ann")

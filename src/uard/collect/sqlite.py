@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 import sqlite3
 import threading
 import time
 from collections.abc import Callable, Collection, Generator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, final
 
 from uard import _checks
+from uard.collect import schema
 from uard.collect.items import Item, item_of
 from uard.collect.store import (
     LEASE_SECONDS,
@@ -24,45 +27,12 @@ from uard.collect.store import (
     Request,
     StoreError,
     hashed,
+    part_name,
+    taken_back,
 )
 from uard.ratings.table import FIELDS, LONGEST, Answer, Answers
 
-VERSION = 1
-APPLICATION = 0x75617264  # "uard", so that `file` and we know whose database it is
 PATIENCE = 10.0  # seconds to wait for another process that writes
-
-_SCHEMA = f"""
-CREATE TABLE items (seq INTEGER PRIMARY KEY, id TEXT NOT NULL UNIQUE, content TEXT NOT NULL);
-CREATE TABLE raters (seq INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, paused INTEGER NOT NULL DEFAULT 0, link TEXT);
-CREATE TABLE sessions (hash TEXT PRIMARY KEY, rater TEXT NOT NULL REFERENCES raters(name));
-CREATE TABLE answers (seq INTEGER PRIMARY KEY, {", ".join(f'"{name}"' for name in FIELDS)}, UNIQUE (id));
-CREATE UNIQUE INDEX superseded ON answers (supersedes) WHERE supersedes IS NOT NULL;
-CREATE INDEX answered_by ON answers (item, rater);
-CREATE TABLE requests (
-    seq INTEGER PRIMARY KEY, item TEXT NOT NULL REFERENCES items(id), rater TEXT REFERENCES raters(name),
-    kind TEXT NOT NULL, priority REAL NOT NULL, "left" TEXT,
-    lease TEXT UNIQUE, held_by TEXT, held_until REAL, answer TEXT
-);
-CREATE INDEX open_requests ON requests (rater, priority DESC, seq) WHERE answer IS NULL;
-CREATE INDEX held_requests ON requests (held_by) WHERE answer IS NULL;
-CREATE INDEX answered_requests ON requests (answer) WHERE answer IS NOT NULL;
-"""
-
-# What a rater may be shown next, of the requests to one name or to nobody in particular (rater IS ?): open, held by
-# nobody else, not rated by her yet unless that is the point, and not in her hands already by another request. A lease
-# that ends further ahead than any lease can was given by a clock that has jumped back since.
-_NEXT = """
-SELECT seq, item, kind FROM requests AS r
-WHERE answer IS NULL AND rater IS :who AND held_by IS NOT :rater
-  AND (held_by IS NULL OR held_until < :now OR held_until > :now + :term)
-  AND (kind = 'repeat' OR NOT EXISTS (
-        SELECT 1 FROM answers AS a WHERE a.item = r.item AND a.rater = :rater
-        AND (a.value IS NOT NULL OR a.choice IS NOT NULL)
-        AND NOT EXISTS (SELECT 1 FROM answers AS b WHERE b.supersedes = a.id)))
-  AND NOT EXISTS (SELECT 1 FROM requests AS h WHERE h.item = r.item AND h.held_by = :rater AND h.answer IS NULL
-        AND h.seq <> r.seq)
-ORDER BY priority DESC, seq
-"""
 
 
 @final
@@ -99,8 +69,10 @@ class SQLiteStore(AnswerStore):
         self._local = threading.local()
         self._opened: list[sqlite3.Connection] = []
         self._lock = threading.Lock()
+        with suppress(OSError):  # for nobody else's eyes; SQLite says what is wrong if it cannot be made
+            os.close(os.open(self.path, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600))
         with self._changing() as db:
-            self._prepare(db)
+            self._identity = schema.prepare(db, self.path)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies and other processes open the file themselves."""
@@ -114,6 +86,11 @@ class SQLiteStore(AnswerStore):
         """Close it."""
         self.close()
 
+    @property
+    def identity(self) -> str:
+        """See ``AnswerStore``."""
+        return self._identity
+
     def close(self) -> None:
         """Close all connections; a later call opens a new one."""
         with self._lock:
@@ -121,24 +98,6 @@ class SQLiteStore(AnswerStore):
         for connection in opened:
             connection.close()
         self._local = threading.local()
-
-    def _prepare(self, db: sqlite3.Connection) -> None:
-        version, application = (
-            int(db.execute(f"PRAGMA {name}").fetchone()[0]) for name in ("user_version", "application_id")
-        )
-        empty = db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
-        if empty:
-            for statement in _SCHEMA.split(";"):
-                db.execute(statement)
-            db.execute(f"PRAGMA user_version = {VERSION}")
-            db.execute(f"PRAGMA application_id = {APPLICATION}")
-        elif application != APPLICATION:
-            raise StoreError(f"{self.path} is a database of something else than answers to uard")
-        elif version != VERSION:
-            age = "an older" if version < VERSION else "a newer"
-            raise StoreError(
-                f"{self.path} is of version {version}, made by {age} uard; this one reads {VERSION}; it was not changed"
-            )
 
     def _connection(self) -> sqlite3.Connection:
         found: sqlite3.Connection | None = getattr(self._local, "connection", None)
@@ -183,9 +142,15 @@ class SQLiteStore(AnswerStore):
         """See ``AnswerStore``."""
         with self._reading() as db:
             rows = db.execute("SELECT seq, content FROM items WHERE seq > ? ORDER BY seq", (after,)).fetchall()
-        return tuple(item_of(row["content"]) for row in rows), rows[-1]["seq"] if rows else after
+        return tuple(self._item_of(row["content"], row["seq"]) for row in rows), rows[-1]["seq"] if rows else after
 
-    def invite(self, rater: str) -> str:
+    def _item_of(self, content: str, place: int) -> Item:
+        try:
+            return item_of(content)
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise StoreError(f"{self.path} is damaged: what stands there as item {place} is none ({error})") from None
+
+    def invite(self, rater: str, *, end_sessions: bool = False) -> str:
         """See ``AnswerStore``."""
         _checks.instance("rater", rater, str, "a name")
         if not rater.strip() or rater != rater.strip() or len(rater) > LONGEST or not rater.isprintable():
@@ -198,6 +163,8 @@ class SQLiteStore(AnswerStore):
                 "INSERT INTO raters (name, link) VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET link = excluded.link",
                 (rater, hashed(secret)),
             )
+            if end_sessions:
+                db.execute("DELETE FROM sessions WHERE rater = ?", (rater,))
         return secret
 
     def enter(self, secret: str) -> tuple[str, str]:
@@ -282,26 +249,52 @@ class SQLiteStore(AnswerStore):
             for row in found:
                 if row["seq"] in known:
                     db.execute("UPDATE requests SET held_until = ? WHERE seq = ?", (until, row["seq"]))
-            return tuple(_lease_of(db, row["seq"], rater) for row in found)
+            return tuple(self._lease_of(db, row["seq"], rater) for row in found)
+
+    def leased(self, name: str) -> Lease | None:
+        """See ``AnswerStore``."""
+        with self._reading() as db:
+            row = db.execute(
+                'SELECT l.rater, l."left", r.kind, r.item, r.lease, r.held_until, items.seq, items.content '
+                "FROM leases AS l JOIN requests AS r ON r.seq = l.request JOIN items ON items.id = r.item "
+                "WHERE l.id = ?",
+                (name,),
+            ).fetchone()
+        if row is None:
+            return None
+        until = row["held_until"] if row["lease"] == name else 0.0
+        return Lease(name, self._item_of(row["content"], row["seq"]), row["rater"], row["kind"], until, row["left"])
+
+    def _lease_of(self, db: sqlite3.Connection, seq: int, rater: str) -> Lease:
+        row = db.execute(
+            'SELECT lease, kind, held_until, r."left" AS side, content, items.seq AS place '
+            "FROM requests AS r JOIN items ON items.id = r.item WHERE r.seq = ?",
+            (seq,),
+        ).fetchone()
+        item = self._item_of(row["content"], row["place"])
+        return Lease(row["lease"], item, rater, row["kind"], row["held_until"], row["side"])
 
     @staticmethod
     def _next(db: sqlite3.Connection, rater: str, now: float, without: Collection[str]) -> sqlite3.Row | None:
         """Return the open request that comes first: those to this rater before those to anybody."""
         for who in (rater, None):
             given = {"who": who, "rater": rater, "now": now, "term": LEASE_SECONDS}
-            rows = db.execute(_NEXT, given)
+            rows = db.execute(schema.NEXT, given)
             for row in rows:
                 if row["item"] not in without:
                     return row
         return None
 
-    @staticmethod
-    def _hold(db: sqlite3.Connection, row: sqlite3.Row, rater: str, now: float) -> None:
-        content = item_of(db.execute("SELECT content FROM items WHERE id = ?", (row["item"],)).fetchone()[0]).content
+    def _hold(self, db: sqlite3.Connection, row: sqlite3.Row, rater: str, now: float) -> None:
+        stored = db.execute("SELECT seq, content FROM items WHERE id = ?", (row["item"],)).fetchone()
+        content, name = self._item_of(stored["content"], stored["seq"]).content, secrets.token_hex(16)
         left = secrets.choice([content["left"], content["right"]]) if content["kind"] == "pair" else None
         db.execute(
             'UPDATE requests SET lease = ?, held_by = ?, held_until = ?, "left" = ? WHERE seq = ?',
-            (secrets.token_hex(16), rater, now + LEASE_SECONDS, left, row["seq"]),
+            (name, rater, now + LEASE_SECONDS, left, row["seq"]),
+        )
+        db.execute(
+            'INSERT INTO leases (id, request, rater, "left") VALUES (?, ?, ?, ?)', (name, row["seq"], rater, left)
         )
 
     def put(self, answers: Sequence[Answer], lease: str | None = None) -> tuple[Answer, ...]:
@@ -312,17 +305,20 @@ class SQLiteStore(AnswerStore):
             known = [_stored(db, a.id) for a in answers]
             if known[0] is not None:
                 for a, there in zip(answers, known, strict=True):
-                    if there is None or _essence(there) != _essence(a):
+                    if there is None or _differs(there, a):
                         raise ConflictError(f"another answer is stored as {a.id!r}")
                 return tuple(a for a in known if a is not None)
-            for a in answers:
+            rows = list(answers) if lease is None else _about_lease(db, answers, lease)
+            for a in rows:
                 self._add(db, a)
             if lease is not None:
+                said = rows[0].id
+                db.execute("UPDATE leases SET answer = ? WHERE id = ?", (said, lease))
                 db.execute(
-                    "UPDATE requests SET answer = ? WHERE lease = ? AND answer IS NULL AND item = ?",
-                    (answers[0].id, lease, answers[0].item),
+                    "UPDATE requests SET answer = ? WHERE lease = ? AND (answer IS NULL OR answer = ?)",
+                    (said, lease, rows[0].supersedes),
                 )
-        return tuple(answers)
+        return tuple(rows)
 
     @staticmethod
     def _add(db: sqlite3.Connection, answer: Answer) -> None:
@@ -343,6 +339,7 @@ class SQLiteStore(AnswerStore):
             db.execute(
                 "UPDATE requests SET answer = NULL, held_by = ? WHERE answer = ?", (answer.rater, answer.supersedes)
             )
+            db.execute("UPDATE leases SET answer = NULL WHERE answer = ?", (answer.supersedes,))
 
     def answers(self, after: int = 0) -> tuple[Answers, int]:
         """See ``AnswerStore``."""
@@ -355,13 +352,36 @@ def _last_request(db: sqlite3.Connection) -> int:
     return int(db.execute("SELECT coalesce(max(seq), 0) FROM requests").fetchone()[0])
 
 
-def _lease_of(db: sqlite3.Connection, seq: int, rater: str) -> Lease:
+def _about_lease(db: sqlite3.Connection, answers: Sequence[Answer], lease: str) -> list[Answer]:
+    """Return answers as they are stored for a lease: of its kind, and in place of what was said of it before.
+
+    Two tabs, or a page whose answer came late, may both answer one lease. What comes last stands, whichever it is, and
+    it is no hidden repeat.
+    """
     row = db.execute(
-        'SELECT lease, kind, held_until, r."left" AS side, content FROM requests AS r JOIN items ON items.id = r.item '
-        "WHERE r.seq = ?",
-        (seq,),
+        "SELECT l.rater, l.answer, r.item, r.kind FROM leases AS l JOIN requests AS r ON r.seq = l.request "
+        "WHERE l.id = ?",
+        (lease,),
     ).fetchone()
-    return Lease(row["lease"], item_of(row["content"]), rater, row["kind"], row["held_until"], row["side"])
+    first = answers[0]
+    if row is None or (row["rater"], row["item"]) != (first.rater, first.item):
+        raise ConflictError(f"{first.rater} was not shown this item under this lease")
+    parts = db.execute(
+        "SELECT * FROM answers AS a WHERE item = :item AND rater = :rater "
+        "AND (id = :said OR substr(id, 1, length(:said) + 1) = :said || '.') "
+        "AND (value IS NOT NULL OR choice IS NOT NULL) "
+        "AND NOT EXISTS (SELECT 1 FROM answers AS b WHERE b.supersedes = a.id) ORDER BY seq",
+        {"item": first.item, "rater": first.rater, "said": row["answer"]},
+    ).fetchall()
+    before = {part["attribute"]: _answer_of(part) for part in parts}
+    rows = [replace(a, kind=row["kind"]) for a in answers]
+    rows = [replace(a, supersedes=a.supersedes or _name(before.pop(a.attribute, None))) for a in rows]
+    silent = taken_back(list(before.values()), first.id, source=first.source, now=first.given_at)
+    return rows + [replace(a, id=part_name(first.id, len(rows) + k)) for k, a in enumerate(silent)]
+
+
+def _name(answer: Answer | None) -> str | None:
+    return None if answer is None else answer.id
 
 
 def _stored(db: sqlite3.Connection, name: str) -> Answer | None:
@@ -373,9 +393,14 @@ def _answer_of(row: sqlite3.Row) -> Answer:
     return Answer(**{name: row[name] for name in FIELDS})
 
 
-def _essence(answer: Answer) -> tuple[Any, ...]:
-    """Return what makes it this answer: all but the times, which differ when it is sent again."""
-    return tuple(getattr(answer, name) for name in FIELDS if name not in ("shown_at", "given_at"))
+def _differs(there: Answer, sent: Answer) -> bool:
+    """Whether two answers of one name are not the same: of another content, or in place of another.
+
+    Times differ when it is sent again; what the store itself has decided (the kind, what it takes the place of) is not
+    known to who sends it.
+    """
+    left_to_us = {"shown_at", "given_at", "kind"} | ({"supersedes"} if sent.supersedes is None else set[str]())
+    return any(getattr(there, name) != getattr(sent, name) for name in FIELDS if name not in left_to_us)
 
 
 def _expect(db: sqlite3.Connection, table: str, column: str, value: str, what: str) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from uard import _checks
 from uard.collect.items import Item
@@ -113,6 +113,34 @@ def hashed(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
+def part_name(name: str, number: int) -> str:
+    """Return the name of an answer's part: the question itself is 0, its attributes are counted from 1.
+
+    Examples:
+        >>> part_name("a1", 0), part_name("a1", 2)
+        ('a1', 'a1.2')
+    """
+    return f"{name}.{number}" if number else name
+
+
+def taken_back(before: Sequence[Answer], name: str, *, source: str, now: float) -> list[Answer]:
+    """Return the answers that take back all that was said in one go.
+
+    Examples:
+        >>> [a.supersedes for a in taken_back([Answer("a1", "x", "ann", 1.0)], "b1", source="owner", now=0.0)]
+        ['a1']
+
+    Args:
+        before: What was said.
+        name: Of the first new answer.
+        source: Where it is taken back.
+        now: Seconds since 1970.
+    """
+    times = {"shown_at": now, "given_at": now}
+    empty = {"value": None, "choice": None, "comment": "", "source": source} | times
+    return [replace(a, id=part_name(name, k), supersedes=a.id, **empty) for k, a in enumerate(before)]
+
+
 class AnswerStore(ABC):
     """The interface. All methods may be called from any thread, and by several processes on one store.
 
@@ -126,6 +154,11 @@ class AnswerStore(ABC):
         (True, ())
     """
 
+    @property
+    @abstractmethod
+    def identity(self) -> str:
+        """A random name that the store was given when it was made; a copy of it keeps the name."""
+
     @abstractmethod
     def add_items(self, items: Sequence[Item]) -> int:
         """Add items, and return how many of them were new."""
@@ -135,8 +168,12 @@ class AnswerStore(ABC):
         """Return the items that were added after a place, in that order, and the place of the last."""
 
     @abstractmethod
-    def invite(self, rater: str) -> str:
+    def invite(self, rater: str, *, end_sessions: bool = False) -> str:
         """Return a new link secret for a rater, who may be new; links given to her before are void.
+
+        Args:
+            rater: Her name.
+            end_sessions: Whether browsers that are known as hers are forgotten.
 
         Raises:
             InvalidValueError: the name is empty, too long, or has characters that cannot be printed.
@@ -193,21 +230,29 @@ class AnswerStore(ABC):
         """
 
     @abstractmethod
+    def leased(self, name: str) -> Lease | None:
+        """Return a lease that was ever given, also one that has ended or was answered; None if there was none."""
+
+    @abstractmethod
     def put(self, answers: Sequence[Answer], lease: str | None = None) -> tuple[Answer, ...]:
         """Add the answers that were given in one go: all of them or none.
 
         An answer that says nothing takes back the one that it supersedes. Its request is open again for the same
         rater, unless the owner took it back (``source`` is ``owner``).
 
+        Answers to a lease get its kind. If something that was said of the same lease stands, they take its place: of
+        several at once the one that is stored last stands alone.
+
         Args:
             answers: At least one. If the first is there already, the whole call was heard before: nothing happens.
-            lease: The request that they answer, if any; it may have expired.
+            lease: What they answer, if anything; it may have expired.
 
         Returns:
-            The answers as they are stored.
+            The answers as they are stored, and those that take back what was said of the lease before.
 
         Raises:
-            ConflictError: something else is stored under one of their names; they supersede what is not there, is
+            ConflictError: something else is stored under one of their names; the lease was not given to their rater for
+                their item; they supersede what is not there, is
                 superseded already, or is of another rater or item; or they are of an unknown item or rater.
         """
 
