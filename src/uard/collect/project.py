@@ -135,6 +135,13 @@ class Question:
             self.kind, f"slider {between}"
         )
 
+    @property
+    def identity(self) -> str:
+        """A name made of all that decides what can be answered; an answer that was given under another is none here."""
+        stars = self.stars if self.kind == "stars" else None
+        decides = (self.kind, float(self.low), float(self.high), stars, self.attributes, self.comment)
+        return hashlib.sha256(repr(decides).encode()).hexdigest()[:12]
+
     def known(self, item: str, kind: str) -> Known | None:
         """Return what should be said of an item of practice or gold."""
         return next((k for k in (self.practice if kind == "practice" else self.gold) if k.item == item), None)
@@ -232,7 +239,10 @@ class Project:
             ) from None
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
             raise _checks.InvalidValueError(str(file), str(error), "a TOML file that can be read") from None
-        (path / MEDIA).mkdir(exist_ok=True)
+        try:
+            (path / MEDIA).mkdir(exist_ok=True)
+        except OSError as error:
+            raise _checks.InvalidValueError(str(path / MEDIA), error.strerror, "a folder, which holds clips") from None
         return Project(path, question_of(data, str(file)))
 
     def store(self) -> SQLiteStore:
