@@ -9,7 +9,9 @@ import sys
 import numpy as np
 import pytest
 
+from uard.collect import Project
 from uard.ratings import readers
+from uard.ratings.table import Answer
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for a child")
 
@@ -47,6 +49,15 @@ def test_a_panel_at_the_page_says_what_its_law_says(served, tmp_path):
     assert (log.ratings[lies, 0] < 0).all()
     status = json.loads(collect(tmp_path, "status", "grid", "--json", "-").stdout)
     assert {r["name"]: r["answers"] for r in status["raters"]}["simulated-1"] == numbers["answers"]
+
+
+def test_where_people_rate_nobody_is_simulated_unasked(served, tmp_path):
+    with Project.open(tmp_path / "grid").store() as store:
+        store.put([Answer("a1", store.items()[0][0].id, "ann", 1.0)])
+    refused = collect(tmp_path, "simulate", "grid", "--url", served, code=2)
+    assert "ann has answered, and this is not undone" in " ".join(refused.stderr.split())
+    said = collect(tmp_path, "simulate", "grid", "--url", served, "--beside-people", "--idle", 1)
+    assert "answers; median" in said.stdout
 
 
 def test_what_goes_wrong_is_said(served, tmp_path):

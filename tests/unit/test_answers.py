@@ -83,6 +83,8 @@ def test_rows_of_preferences_for_trl():
     assert (rows[1]["chosen"], len(rows)) == (ITEMS["y"]["completion"], 2)
     with pytest.raises(InvalidValueError, match="there are no comparisons"):
         export.write(SAID, ITEMS, "trl")
+    with pytest.raises(InvalidValueError, match="TRL's rows hold texts"):
+        export.write(said, {"x": {"kind": "clip"}, "y": {"kind": "clip"}}, "trl")
 
 
 def test_label_studio_reads_and_we_read_it_back(tmp_path):

@@ -79,7 +79,8 @@ def _flat(space: gymnasium.Space[Any], batch: Any) -> Float[np.ndarray, "B width
         box = cast("Any", space)  # the precision of its bounds is not in its type
         low, high = (np.asarray(bound, float).ravel() for bound in (box.low, box.high))
         bounded = np.isfinite(low) & np.isfinite(high)
-        middle, half = np.where(bounded, (low + high) / 2, 0.0), np.where(bounded, (high - low) / 2, 1.0)
+        low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+        middle, half = (low + high) / 2, (high - low) / 2
         return np.clip((flat - middle) / np.where(half > 0, half, 1.0), -BOUND, BOUND)
     rows = gymnasium.vector.utils.iterate(gymnasium.vector.utils.batch_space(space, _length(batch)), batch)
     return np.array([gymnasium.spaces.flatten(space, row) for row in rows], float)

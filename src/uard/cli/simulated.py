@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -13,13 +14,17 @@ from uard._support.text import counted
 from uard.cli import terminal
 from uard.cli.settings import Pairs
 from uard.cli.settings import settings as read
+from uard.ratings.panels import RANGE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rich.console import Console
 
+    from uard.collect import Question
     from uard.ratings.panels import Panel, RatingLaw
+
+NAME = "simulated-"  # before the number of a rater
 
 
 @dataclass(frozen=True)
@@ -27,13 +32,15 @@ class Simulate:
     """Let a simulated panel rate at a page that `uard collect serve` shows on this machine: for trying, not for data.
 
     The raters come in by links of their own, and answer through the same interface as browsers do. They leave when
-    there has been nothing to rate for a while.
+    there has been nothing to rate for a while. What they say stands in the project as what people say does, so take a
+    copy of one in which people rate.
     """
 
     project: Positional[str]
     """A project's folder."""
     panel: str = "random:7"
-    """Who rates: a name, random:SEED, or random:SEED:SCALE for rewards of another size than a grid's."""
+    """Who rates: a name, random:SEED, or random:SEED:SCALE. The scale, which is 1 for a grid's rewards, is that of the
+    project's range if it is left out."""
     url: str = "http://127.0.0.1:8321"
     """The page's address."""
     environment: str | None = None
@@ -49,6 +56,8 @@ class Simulate:
     """Seconds that each rater takes for an answer."""
     seed: int = 0
     """Of what they draw."""
+    beside_people: bool = False
+    """Rate also where people have answered."""
     json: str | None = None
     """Write one JSON object to this file; - for standard output."""
 
@@ -66,10 +75,15 @@ class Simulate:
         if self.answers is not None:
             _checks.whole("answers", self.answers, low=1)
         _checks.whole("seed", self.seed)
-        panel, project = as_panel(self.panel), Project.open(self.project)
+        project = Project.open(self.project)
+        panel = as_panel(self._scaled(project.question))
         law_of = law_by_reward(panel) if self.environment is None else self._by_tables(panel)
         with closing(project.store()) as store:
-            links = {f"simulated-{k + 1}": "" for k in range(len(panel.raters))}
+            people = [a.rater for a in store.answers()[0] if not a.rater.startswith(NAME)]
+            if people and not self.beside_people:
+                allowed = f"a copy of it, or with --beside-people: {people[0]} has answered, and this is not undone"
+                raise _checks.InvalidValueError("project", self.project, allowed)
+            links = {f"{NAME}{k + 1}": "" for k in range(len(panel.raters))}
             links = {name: store.invite(name) for name in links}
         visit = Simulation(
             self.url, links, project, law_of, self.seed, pause=self.pause, idle=self.idle, most=self.answers
@@ -92,6 +106,11 @@ class Simulate:
             terminal.say(terminal.output(), f"{counted(numbers['answers'], 'answer')}; {each}")
         if report.errors:
             raise SystemExit(1)
+
+    def _scaled(self, question: Question) -> str:
+        """Return the panel's name, with the scale of the question's range if it is a random one without a scale."""
+        scale = (question.high - question.low) / (RANGE[1] - RANGE[0])
+        return f"{self.panel}:{scale:.6f}" if re.fullmatch(r"random:\d+", self.panel) else self.panel
 
     def _by_tables(self, panel: Panel) -> Callable[[Any], RatingLaw]:
         from uard.envs import names

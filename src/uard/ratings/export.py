@@ -25,8 +25,8 @@ def write(answers: Answers, items: Contents, form: str) -> bytes:
 
     * ``csv``, ``jsonl``, ``parquet``: a row per answer that stands, practice left out: item, rater, rating or choice,
       what the environment paid, further attributes as columns. ``uard doctor`` and ``uard preferences`` read them.
-    * ``trl``: a row per comparison that is no tie, as TRL's ``DPOTrainer`` and ``RewardTrainer`` take them (JSONL):
-      prompt, chosen and rejected; for clips the names of the two.
+    * ``trl``: a row per comparison of texts that is no tie, as TRL's ``DPOTrainer`` and ``RewardTrainer`` take them
+      (JSONL): prompt, chosen and rejected.
     * ``label-studio``: a task per item with one annotation per rater, as Label Studio exports and imports it.
     * ``record``: every answer that was ever given, superseded ones, practice and what was taken back included (JSONL);
       ``read_record`` reads it.
@@ -45,7 +45,8 @@ def write(answers: Answers, items: Contents, form: str) -> bytes:
 
     Raises:
         UnknownNameError: there is no such form.
-        InvalidValueError: Parquet is wanted and pyarrow is not installed, or there are no comparisons for ``trl``.
+        InvalidValueError: Parquet is wanted and pyarrow is not installed, or there are no comparisons of texts for
+            ``trl``.
     """
     return _WRITERS[_checks.choose("form", form, FORMS)](answers, items)
 
@@ -163,7 +164,10 @@ def _trl(answers: Answers, items: Contents) -> bytes:
         if c.tie:
             continue
         chosen, rejected = items.get(c.preferred, {}), items.get(c.other, {})
-        row: Row = {"chosen": chosen.get("completion", c.preferred), "rejected": rejected.get("completion", c.other)}
+        if "completion" not in chosen or "completion" not in rejected:
+            allowed = "a form for clips (csv, jsonl, parquet): TRL's rows hold texts"
+            raise _checks.InvalidValueError("form", "trl", allowed)
+        row: Row = {"chosen": chosen["completion"], "rejected": rejected["completion"]}
         if chosen.get("prompt") is not None and chosen.get("prompt") == rejected.get("prompt"):
             row = {"prompt": chosen["prompt"]} | row
         rows.append(row | {"rater": c.rater})
