@@ -51,6 +51,20 @@ def test_a_panel_at_the_page_says_what_its_law_says(served, tmp_path):
     assert {r["name"]: r["answers"] for r in status["raters"]}["simulated-1"] == numbers["answers"]
 
 
+def test_items_are_listed_by_name(tmp_path):
+    (tmp_path / "sums.jsonl").write_text(
+        '{"prompt": "2 + 2?", "completion": "4"}\n{"prompt": "2 + 2?", "completion": "5"}\n'
+    )
+    collect(tmp_path, "texts", "sums.jsonl", "sums", "--kind", "pairs")
+    found = json.loads(collect(tmp_path, "items", "sums", "--json", "-").stdout)["items"]
+    with Project.open(tmp_path / "sums").store() as store:
+        assert [row["item"] for row in found] == [item.id for item in store.items()[0]]
+    assert [row["kind"] for row in found] == ["text", "text", "pair"]
+    shown = collect(tmp_path, "items", "sums").stdout
+    assert all(row["item"] in shown for row in found)
+    assert max(map(len, shown.splitlines())) <= 80
+
+
 def test_where_people_rate_nobody_is_simulated_unasked(served, tmp_path):
     with Project.open(tmp_path / "grid").store() as store:
         store.put([Answer("a1", store.items()[0][0].id, "ann", 1.0)])

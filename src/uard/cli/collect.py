@@ -13,6 +13,7 @@ from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 from uard import __version__, _checks
 from uard._support.text import counted
 from uard.cli import progress, projects, terminal
+from uard.cli.items import Items
 from uard.cli.projects import ASKED, AskedOptions
 from uard.cli.settings import Pairs
 from uard.cli.settings import settings as read
@@ -264,6 +265,7 @@ _Action = (
     | Annotated[Status, subcommand("status")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Simulate, subcommand("simulate")]
+    | Annotated[Items, subcommand("items")]
 )
 
 
