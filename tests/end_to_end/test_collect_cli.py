@@ -215,9 +215,48 @@ def test_an_export_must_have_a_form_and_destroys_nothing(run):
     code, _, err = run("export", "grid", "said.txt")
     assert code == 2
     assert "or --form says what it holds" in err
-    code, _, err = run("export", "grid", "grid/answers.sqlite", "--form", "csv")
+    (sheet,) = [p for p in os.listdir("grid/media") if p.endswith(".webp")][:1]
+    for own in ("answers.sqlite", "project.toml", f"media/{sheet}", "media/new.csv", "serving.lock"):
+        for command in (
+            ("export", "grid", f"grid/{own}", "--form", "csv"),
+            ("status", "grid", "--json", f"grid/{own}"),
+            ("items", "grid", "--json", f"grid/{own}"),
+            ("simulate", "grid", "--json", f"grid/{own}"),
+        ):
+            code, _, err = run(*command)
+            assert code == 2
+            assert "must be another file than those of the project grid" in err
+    os.link("grid/answers.sqlite", "other.csv")
+    code, _, err = run("export", "grid", "other.csv")
     assert code == 2
     assert "which it would destroy" in err
+    assert len(items_of("grid")) == 2
+
+
+def test_pairs_that_cannot_be_drawn_make_no_project(run, tmp_path):
+    for option, value in (("--pairs", 0), ("--seed", -1)):
+        code, _, err = run("record", "TrapGrid6", "grid", "--segments", 2, "--length", 1, option, value)
+        assert code == 2
+        assert f"{option} = {value}" in err
+        assert not (tmp_path / "grid").exists()
+
+
+def test_a_link_is_to_a_page(run):
+    run("record", "TrapGrid6", "grid", "--segments", 2, "--length", 1)
+    code, _, err = run("invite", "grid", "ann", "--url", "javascript:alert(1)")
+    assert code == 2
+    assert "url = 'javascript:alert(1)': must be an address such as" in err
+    assert "ann, a new rater" in run("invite", "grid", "ann")[2]
+    assert "a new rater" not in run("invite", "grid", "ann")[2]
+
+
+def test_an_item_that_is_not_there_is_named(run, tmp_path):
+    run("record", "TrapGrid6", "grid", "--segments", 2, "--length", 1)
+    with (tmp_path / "grid" / "project.toml").open("a") as file:
+        file.write('[[gold]]\nitem = "3f9a"\nvalue = 0.0\n')
+    code, _, err = run("status", "grid")
+    assert code == 0
+    assert "[[gold]] names an item that is not in the project: 3f9a" in err
 
 
 def test_a_store_of_another_version_is_left_alone(run, tmp_path):

@@ -135,6 +135,21 @@ def test_a_record_keeps_every_character_of_a_comment():
     assert export.read_record(export.write(said, {}, "record")) == said
 
 
+def test_half_an_emoji_in_an_old_store_does_not_stop_an_export():
+    items = {"x": {"kind": "text", "prompt": "p", "completion": "\ud800", "stratum": "\ud83d"}}
+    said = Answers((rated("c1", "x", "ann", 0.5), rated("c2", "x", "bob", 0.5)))
+    for form in ("csv", "jsonl", "parquet", "label-studio", "record"):
+        assert export.write(said, items, form)
+
+
+def test_a_part_of_what_was_given_in_one_go_keeps_its_name():
+    main = Answer("b1", "x", "ann", 0.5)
+    part = Answer("b1.1", "x", "ann", 1.0, attribute="safe")
+    said = Answers((main, part, Answer("o1", "x", "ann", supersedes="b1")))
+    (row,) = export.rows_of(said, ITEMS)
+    assert (row["id"], row["safe"]) == ("b1", 1.0)
+
+
 def test_nothing_to_export_is_an_empty_table():
     assert export.write(Answers(), {}, "csv").count(b"\n") == 1
     assert export.write(Answers(), {}, "jsonl") == b""
@@ -154,6 +169,7 @@ def test_nothing_to_export_is_an_empty_table():
         ({"choice": "skip"}, "None where the choice is 'skip'"),
         ({"kind": "test"}, "kind = 'test'"),
         ({"given_at": -1.0}, "given_at"),
+        ({"given_at": 1e12}, "given_at"),
         ({"comment": "x" * 2001}, "comment"),
     ],
 )

@@ -406,6 +406,8 @@ def test_two_processes_killed_at_any_moment_lose_no_acknowledged_answer(store):
         (lambda: text_item("p", " "), "completion"),
         (lambda: text_item("p", "x" * 100_001), "len\\(completion\\) = 100001"),
         (lambda: text_item("p", "x", reward=float("nan")), "reward = nan"),
+        (lambda: text_item("p", "x", stratum="\ud800"), "stratum"),
+        (lambda: text_item("p", "x", stratum="x" * 201), "stratum"),
         (lambda: pair_item(X, X), "another item"),
         (lambda: pair_item("x", "y"), "32 hexadecimal digits"),
         (lambda: clip_item("../../secret.webp", 1, 1, (8, 8)), "sheet"),

@@ -7,6 +7,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
+from urllib.parse import urlsplit
 
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from uard.collect import Project
+    from uard.ratings.table import Answers
 
 PORT = 8321
 PASSWORD = "UARD_OWNER_PASSWORD"  # an environment variable: an option would stand in everybody's list of processes
@@ -67,6 +69,7 @@ class Record:
         from uard.cli import acting
         from uard.collect.record import record
 
+        _check_pairs(self.pairs, self.seed)
         with (
             closing(acting.environment(self.environment, read(self.set))) as env,
             projects.begun(self.project, self.asked) as project,
@@ -112,6 +115,7 @@ class Texts:
         """Read, make the project, and say what comes next."""
         from uard.collect.texts import texts
 
+        _check_pairs(self.pairs, self.seed)
         with projects.begun(self.project, self.asked) as project:
             items = texts(self.file, project)
         prompts = len({item.content["prompt"] for item in items})
@@ -174,17 +178,25 @@ class Invite:
     """A project's folder."""
     name: Positional[str]
     """The rater's name, as it will stand in the table."""
-    url: str = f"http://127.0.0.1:{PORT}"
-    """The address by which raters reach the page."""
+    url: str | None = None
+    """The address by which raters reach the page; that of the running server if left out."""
 
     def run(self, console: Console) -> None:
         """Invite."""
         from uard.collect import Project
 
-        with closing(Project.open(self.project).store()) as store:
+        project = Project.open(self.project)
+        url = (self.url or project.served_at() or f"http://127.0.0.1:{PORT}").rstrip("/")
+        parts = urlsplit(url)
+        if parts.scheme not in ("http", "https") or not parts.hostname:
+            raise _checks.InvalidValueError("url", self.url, "an address such as https://rate.example.org")
+        with closing(project.store()) as store:
+            new = self.name not in {rater.name for rater in store.raters()}
             secret = store.invite(self.name)
-        terminal.say(terminal.output(), f"{self.url.rstrip('/')}/enter/{secret}")
-        terminal.say(console, f"give this link to {self.name}: it works once. Next: uard collect serve {self.project}")
+        terminal.say(terminal.output(), f"{url}/enter/{secret}")
+        serve = "" if project.served_at() else f" Next: uard collect serve {self.project}"
+        who = f"{self.name}, a new rater" if new else self.name
+        terminal.say(console, f"give this link to {who}: it works once.{serve}")
 
 
 @dataclass(frozen=True)
@@ -200,8 +212,8 @@ class Status:
         """Read the store and print numbers."""
         from uard.collect import Project
 
-        terminal.check_json(self.json)
         project = Project.open(self.project)
+        project.outside(self.json, "json")
         found = _status(project)
         if self.json is not None:
             terminal.write_json({"version": __version__, "project": self.project} | found, self.json)
@@ -214,6 +226,8 @@ class Status:
                 terminal.say(out, line)
         for name, why in found["damaged"].items():
             terminal.warning(console, f"item {name} is not shown: {why}")
+        for name, table in found["unknown"].items():
+            terminal.warning(console, f"[[{table}]] names an item that is not in the project: {name}")
         terminal.say(console, f"next: {_next(found, self.project)}")
 
 
@@ -240,7 +254,7 @@ class Export:
             allowed = f"a file that ends in {', '.join(_ENDINGS)}, or --form says what it holds"
             raise _checks.InvalidValueError("file", self.file, allowed)
         project = Project.open(self.project)
-        files.prepare(self.file, "file", *(str(path) for path in project.folder.iterdir() if path.is_file()))
+        project.outside(self.file, "file")
         with closing(project.store()) as store:
             (answers, _), (items, _) = store.answers(), store.items()
         data = export.write(answers, {item.id: item.content for item in items}, form)
@@ -250,11 +264,24 @@ class Export:
         except OSError as error:
             allowed = f"a file that can be written ({error.strerror or error})"
             raise _checks.InvalidValueError("file", self.file, allowed) from None
-        comparisons = project.question.kind == "pairs"
-        after = "uard preferences" if comparisons else "uard raters"
-        readable = form in ("csv", "jsonl", "parquet") and len(answers.standing())
-        told = f". Next: {after} {self.file}" if readable else ""
-        terminal.say(console, f"{counted(len(answers.standing()), 'answer')} in {self.file}{told}")
+        terminal.say(console, f"{_held(answers, data, form)} in {self.file}{self._next(answers, project, form)}")
+
+    def _next(self, answers: Answers, project: Project, form: str) -> str:
+        """Return what can be done with the file."""
+        if form not in ("csv", "jsonl", "parquet") or not answers.standing():
+            return ""
+        return f". Next: {'uard preferences' if project.question.kind == 'pairs' else 'uard raters'} {self.file}"
+
+
+def _held(answers: Answers, data: bytes, form: str) -> str:
+    """Return how many rows a file holds, and why they may be fewer than the answers."""
+    if form == "record":
+        return f"{counted(len(answers), 'answer')}, practice and what was taken back included,"
+    rated = sum(not a.attribute and a.kind != "practice" for a in answers.standing())
+    if form == "trl":
+        preferences = counted(data.count(b"\n"), "preference")
+        return f"{preferences} of {counted(rated, 'answer')}, without ties and skips,"
+    return counted(rated, "answer")
 
 
 _Action = (
@@ -278,6 +305,13 @@ class Collect:
     def run(self, console: Console) -> None:
         """Do what was asked for."""
         self.action.run(console)
+
+
+def _check_pairs(pairs: int | None, seed: int) -> None:
+    """Refuse before the project is made, not after it, what no pairs can be drawn by."""
+    if pairs is not None:
+        _checks.whole("--pairs", pairs, low=1, high=1_000_000)
+    _checks.whole("--seed", seed, low=0, high=2**63 - 1)
 
 
 def _status(project: Project) -> dict[str, Any]:
@@ -304,6 +338,7 @@ def _status(project: Project) -> dict[str, Any]:
         "open_requests": open_requests,
         "raters": rows,
         "damaged": project.damaged(items),
+        "unknown": project.unknown(items),
     }
 
 

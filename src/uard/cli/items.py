@@ -35,7 +35,7 @@ class Items:
         from uard.collect import Project
 
         project = Project.open(self.project)
-        terminal.check_json(self.json)
+        project.outside(self.json, "json")
         with closing(project.store()) as store:
             (items, _), (answers, _) = store.items(), store.answers()
         told = Counter(a.item for a in answers.standing() if not a.attribute and a.kind != "practice")

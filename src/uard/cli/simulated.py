@@ -69,13 +69,13 @@ class Simulate:
         from uard.collect.simulate import Simulation, law_by_reward
         from uard.ratings.panels import as_panel
 
-        terminal.check_json(self.json)
         for name, value in (("idle", self.idle), ("pause", self.pause)):
             _checks.number(name, value, low=0, high=1e6)
         if self.answers is not None:
             _checks.whole("answers", self.answers, low=1)
         _checks.whole("seed", self.seed)
         project = Project.open(self.project)
+        project.outside(self.json, "json")
         panel = as_panel(self._scaled(project.question))
         law_of = law_by_reward(panel) if self.environment is None else self._by_tables(panel)
         with closing(project.store()) as store:

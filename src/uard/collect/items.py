@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from uard import _checks
+from uard.ratings.table import LONGEST
 
 KINDS = ("clip", "text", "pair")
 LONGEST_TEXT = 100_000  # characters: a page of more is not read by anybody
@@ -125,7 +126,8 @@ def clip_item(
     width, height = size
     return Item(
         {"kind": "clip", "sheet": sheet, "data": data, "frames": frames, "columns": columns, "width": width}
-        | {"height": height, "fps": float(fps), "reward": _reward(reward), "stratum": stratum, "key": key}
+        | {"height": height, "fps": float(fps), "reward": _reward(reward), "stratum": _stratum(stratum)}
+        | {"key": key}
     )
 
 
@@ -152,7 +154,8 @@ def text_item(prompt: str, completion: str, *, reward: float | None = None, stra
     if not completion.strip():
         raise _checks.InvalidValueError("completion", completion, "text that is not empty")
     return Item(
-        {"kind": "text", "prompt": prompt, "completion": completion, "reward": _reward(reward)} | {"stratum": stratum}
+        {"kind": "text", "prompt": prompt, "completion": completion, "reward": _reward(reward)}
+        | {"stratum": _stratum(stratum)}
     )
 
 
@@ -177,12 +180,19 @@ def pair_item(one: str, other: str, *, stratum: str = "") -> Item:
     if one == other:
         raise _checks.InvalidValueError("other", other, "another item")
     left, right = sorted((one, other))
-    return Item({"kind": "pair", "left": left, "right": right, "stratum": stratum})
+    return Item({"kind": "pair", "left": left, "right": right, "stratum": _stratum(stratum)})
 
 
 def item_of(as_json: str) -> Item:
     """Return the item that ``Item.as_json`` wrote."""
     return Item(cast("dict[str, Any]", json.loads(as_json)))
+
+
+def _stratum(name: str) -> str:
+    _checks.instance("stratum", name, str, "text")
+    if len(name) > LONGEST or (name and not name.isprintable()):
+        raise _checks.InvalidValueError("stratum", name, f"at most {LONGEST} printable characters")
+    return name
 
 
 def _reward(value: float | None) -> float | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
@@ -11,12 +12,15 @@ from typing import Any, cast
 
 from uard import _checks
 from uard._support import files
+from uard.collect.acquisition import Acquisition
 from uard.collect.items import Item
 from uard.collect.sqlite import SQLiteStore
+from uard.ratings.export import COLUMNS
 
 QUESTIONS = ("slider", "stars", "thumbs", "pairs")
-SETTINGS, ANSWERS, MEDIA = "project.toml", "answers.sqlite", "media"
+SETTINGS, ANSWERS, MEDIA, LOCK = "project.toml", "answers.sqlite", "media", "serving.lock"
 MOST_ATTRIBUTES = 8
+LONGEST_ATTRIBUTE = 100  # characters
 
 
 @dataclass(frozen=True)
@@ -109,11 +113,7 @@ class Question:
         _checks.whole("stars", self.stars, low=2, high=10)
         for name in ("question", "unit", "instructions"):
             _checks.instance(name, getattr(self, name), str, "text")
-        if len(self.attributes) > MOST_ATTRIBUTES or len(set(self.attributes)) < len(self.attributes):
-            raise _checks.InvalidValueError("attributes", self.attributes, f"at most {MOST_ATTRIBUTES} different names")
-        for name in self.attributes:
-            if not _checks.instance("attributes", name, str, "names").strip():
-                raise _checks.InvalidValueError("attributes", self.attributes, "names that are not empty")
+        self._check_attributes()
         if self.kind in ("pairs", "thumbs") and self.attributes:
             raise _checks.InvalidValueError("attributes", self.attributes, "left out for pairs and thumbs")
         _checks.truth("comment", self.comment)
@@ -121,6 +121,36 @@ class Question:
         _checks.whole("overlap", self.overlap, low=1, high=1000)
         _checks.number("repeats", self.repeats, low=0, high=0.9)
         _checks.whole("break_after", self.break_after)
+        try:
+            Acquisition(self.acquisition, self.overlap, self.repeats)
+        except _checks.InvalidValueError as error:
+            raise renamed(error, "acquisition") from None
+        for table in ("practice", "gold", "examples"):
+            self._check_known(table, getattr(self, table))
+
+    def _check_attributes(self) -> None:
+        allowed = f"at most {MOST_ATTRIBUTES} different names of 1 to {LONGEST_ATTRIBUTE} printable characters"
+        plain: list[str] = []
+        for name in cast("tuple[Any, ...]", self.attributes):
+            if not isinstance(name, str) or not name.strip() or not name.isprintable() or len(name) > LONGEST_ATTRIBUTE:
+                raise _checks.InvalidValueError("attributes", self.attributes, allowed)
+            if name in COLUMNS or name[0] in "=+-@":
+                clash = f"other names than the columns of the export ({', '.join(COLUMNS)}), not beginning with = + - @"
+                raise _checks.InvalidValueError("attributes", name, clash)
+            plain.append(name)
+        if len(plain) > MOST_ATTRIBUTES or len(set(plain)) < len(plain):
+            raise _checks.InvalidValueError("attributes", self.attributes, allowed)
+
+    def _check_known(self, table: str, entries: tuple[Known, ...]) -> None:
+        """Check that what should be said can be said, and of each item once."""
+        low, high = (0.0, 1.0) if self.kind in ("thumbs", "pairs") else (self.low, self.high)
+        items = [entry.item for entry in entries]
+        for entry in entries:
+            if not low <= entry.value <= high:
+                where = f"{table}: value of item {entry.item}"
+                raise _checks.InvalidValueError(where, entry.value, f"in [{low:g}, {high:g}], which can be answered")
+            if items.count(entry.item) > 1:
+                raise _checks.InvalidValueError(f"{table}: item", entry.item, "there only once")
 
     @property
     def levels(self) -> tuple[float, ...]:
@@ -165,6 +195,8 @@ def question_of(data: Mapping[str, Any], source: str = SETTINGS) -> Question:
         InvalidValueError: naming the file, the field, the value and what is allowed.
     """
     given: dict[str, Any] = dict(data)
+    if "examples" in given:
+        raise _checks.UnknownNameError(f"{source}: table", "examples", _LISTS)
     for table, name in _LISTS.items():
         entries: Any = given.pop(table, [])
         allowed = f"[[{table}]] tables with {', '.join(f.name for f in fields(Known))}"
@@ -185,9 +217,19 @@ def question_of(data: Mapping[str, Any], source: str = SETTINGS) -> Question:
     try:
         return Question(**given)
     except _checks.InvalidValueError as error:
-        raise _checks.InvalidValueError(
-            f"{source}: {error.field}", given.get(error.field), str(error).split(": must be ", 1)[-1]
-        ) from None
+        raise renamed(error, f"{source}: {error.field}") from None
+
+
+def renamed(error: _checks.InvalidValueError, field: str) -> _checks.InvalidValueError:
+    """Return an error about the same value under another name.
+
+    Examples:
+        >>> str(renamed(_checks.InvalidValueError("low", 2, "a number below 1"), "project.toml: low"))
+        'project.toml: low = 2: must be a number below 1'
+    """
+    found = _checks.InvalidValueError(field, None, "")
+    found.args = (field + str(error).removeprefix(error.field),)
+    return found
 
 
 @dataclass(frozen=True)
@@ -253,6 +295,13 @@ class Project:
         """
         return SQLiteStore(self.folder / ANSWERS)
 
+    def served_at(self) -> str | None:
+        """Return the address of the server that shows the project now; None if it tells none."""
+        try:
+            return str(json.loads((self.folder / LOCK).read_bytes())["address"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+
     def keep(self, data: bytes, ending: str) -> str:
         """Keep a file of a clip, and return its name, which is made of its content.
 
@@ -270,6 +319,30 @@ class Project:
     def media(self, name: str) -> Path:
         """Return the path of a file of a clip; it may be missing."""
         return self.folder / MEDIA / name
+
+    def outside(self, target: str | None, field: str) -> None:
+        """Refuse to write over what the project is made of.
+
+        Args:
+            target: Where a file is going to be written; None and ``-`` are nowhere.
+            field: What that is called in the error.
+
+        Raises:
+            InvalidValueError: it is one of the project's own files.
+        """
+        if target is None or target == "-":
+            return
+        own, path = self.folder.resolve(), Path(target).resolve()
+        names = (SETTINGS, LOCK, *(ANSWERS + ending for ending in ("", "-wal", "-shm", "-journal")))
+        if path in {own / name for name in names} or path == own / MEDIA or own / MEDIA in path.parents:
+            raise _checks.InvalidValueError(field, target, f"another file than those of the project {self.folder}")
+        files.prepare(target, field, *(own / name for name in names))
+
+    def unknown(self, items: Iterable[Item]) -> dict[str, str]:
+        """Return the items that practice, gold or examples name and that are not there, each with the table's name."""
+        there = {item.id for item in items}
+        tables = {table: getattr(self.question, name) for table, name in _LISTS.items()}
+        return {k.item: table for table, entries in tables.items() for k in entries if k.item not in there}
 
     def damaged(self, items: Iterable[Item]) -> dict[str, str]:
         """Return which items cannot be shown, and why: a file is missing, or was changed since it was recorded."""
@@ -330,8 +403,6 @@ _COMMENTS = {
 
 def _toml(value: Any) -> str:
     """Return a value as TOML; text with the escapes of JSON, which TOML's basic strings share."""
-    import json
-
     if isinstance(value, Mapping):
         entries = cast("Mapping[str, Any]", value).items()
         return "{ " + ", ".join(f"{json.dumps(str(k))} = {_toml(v)}" for k, v in entries) + " }"

@@ -91,12 +91,12 @@ def rows_of(answers: Answers, items: Contents) -> list[Row]:
             continue
         content = items.get(a.item, {})
         place = a.item, a.rater, a.id.partition(".")[0] if a.attribute else a.id
-        row = rows.setdefault(place, _row(a, content))
+        row = rows.setdefault(place, _row(a, content) | {"id": place[2]})
         if a.attribute:
             row[a.attribute] = a.value
             attributes.append(a.attribute)
         else:
-            row["rating"], row["choice"], row["comment"], row["id"] = a.value, a.choice, a.comment or None, a.id
+            row["rating"], row["choice"], row["comment"] = a.value, a.choice, a.comment or None
     names = [*_COLUMNS, *(n for n in dict.fromkeys(attributes)), *_AFTER]
     used = [n for n in names if any(row.get(n) is not None for row in rows.values())]
     return [{n: row.get(n) for n in used} for row in rows.values()]
@@ -104,6 +104,8 @@ def rows_of(answers: Answers, items: Contents) -> list[Row]:
 
 _COLUMNS = ("item", "rater", "rating", "left", "right", "choice", "reward", "stratum")
 _AFTER = ("comment", "kind", "shown_at", "given_at", "id")
+COLUMNS = (*_COLUMNS, *_AFTER)
+"""Names of the columns of ``rows_of``, which no attribute may have."""
 
 
 def _row(answer: Answer, content: Mapping[str, Any]) -> Row:
@@ -130,7 +132,7 @@ def _csv(answers: Answers, items: Contents) -> bytes:
     writer = csv.DictWriter(out, list(rows[0]) if rows else list(_COLUMNS), lineterminator="\n")
     writer.writeheader()
     writer.writerows([{name: _harmless(value) for name, value in row.items()} for row in rows])
-    return out.getvalue().encode()
+    return out.getvalue().encode(errors="replace")
 
 
 def _harmless(value: Any) -> Any:
@@ -143,7 +145,15 @@ def _jsonl(answers: Answers, items: Contents) -> bytes:
 
 
 def _lines(rows: Sequence[Row]) -> bytes:
-    return "".join(json.dumps(row, ensure_ascii=False, allow_nan=False) + "\n" for row in rows).encode()
+    return "".join(json.dumps(row, ensure_ascii=False, allow_nan=False) + "\n" for row in rows).encode(errors=_HALF)
+
+
+_HALF = "replace"  # half of a surrogate pair, which has no UTF-8
+
+
+def _whole(rows: Sequence[Row]) -> str:
+    """Return rows as JSON that holds no half of a surrogate pair."""
+    return json.dumps(rows, ensure_ascii=False, allow_nan=False).encode(errors=_HALF).decode()
 
 
 def _parquet(answers: Answers, items: Contents) -> bytes:
@@ -154,7 +164,8 @@ def _parquet(answers: Answers, items: Contents) -> bytes:
         allowed = "csv or jsonl, or first: pip install 'uard[doctor]' (pyarrow writes Parquet)"
         raise _checks.InvalidValueError("form", "parquet", allowed) from None
     out = io.BytesIO()
-    parquet.write_table(pa.Table.from_pylist(rows_of(answers, items)), out)
+    rows: list[Row] = json.loads(_whole(rows_of(answers, items)))
+    parquet.write_table(pa.Table.from_pylist(rows), out)
     return out.getvalue()
 
 
@@ -192,7 +203,7 @@ def _label_studio(answers: Answers, items: Contents) -> bytes:
             mark |= {"created_at": _time(a.given_at), "lead_time": a.given_at - a.shown_at, "result": []}
             marks.append(mark)
         mark["result"] += _results(a)
-    return json.dumps(list(tasks.values()), ensure_ascii=False, indent=1, allow_nan=False).encode()
+    return json.dumps(list(tasks.values()), ensure_ascii=False, indent=1, allow_nan=False).encode(errors=_HALF)
 
 
 def _results(answer: Answer) -> list[Row]:

@@ -25,6 +25,7 @@ PAIRED = ("left", "right", "tie")
 THUMBS = ("up", "down")
 LONGEST = 200  # characters of a name
 LONGEST_COMMENT = 2000
+LATEST = 253_402_300_799.0  # the end of the year 9999, after which no calendar has a name for the day
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class Answer:
         if self.choice in PAIRED and (self.left is None or self.right is None or self.left == self.right):
             raise _checks.InvalidValueError("left, right", (self.left, self.right), "two items")
         for name in ("shown_at", "given_at"):
-            _checks.number(name, getattr(self, name), low=0, high=1e12)
+            _checks.number(name, getattr(self, name), low=0, high=LATEST)
         _checks.choose("kind", self.kind, KINDS)
         if len(self.comment) > LONGEST_COMMENT:
             raise _checks.InvalidValueError("comment", self.comment, f"at most {LONGEST_COMMENT} characters")
