@@ -3,6 +3,7 @@
 import dataclasses
 import threading
 import time
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from uard.collect.acquisition import RULES, Acquisition, Known
 from uard.collect.asking import top_up
 from uard.collect.project import Known as Expected
 from uard.collect.sqlite import SQLiteStore
+from uard.collect.store import LEASE_SECONDS
 from uard.ratings import bradley_terry
 from uard.ratings.table import Answer
 
@@ -203,6 +205,46 @@ def test_a_paused_rater_is_asked_nothing_and_her_questions_go_to_others(tmp_path
         store.pause("ann", True)
         assert top_up(project, store, "ann", 4) == 0
         assert top_up(project, store, "bob", 4) == 4
+
+
+def test_nobody_is_asked_what_was_passed_on_when_a_pause_ends(tmp_path):
+    project = project_of(tmp_path, texts(6), ["ann", "bob"], overlap=1, repeats=0.0)
+    with project.store() as store:
+        assert top_up(project, store, "ann", 4) == 4
+        held = store.lease("ann", 4)
+        store.pause("ann", True)
+        assert [top_up(project, store, "bob", 9) for _ in range(3)] == [2, 4, 0]
+        answered(store, "bob", 6)
+        store.pause("ann", False)
+        assert store.lease("ann", 9) == ()
+        assert top_up(project, store, "ann", 9) == 0
+        assert store.open_requests()[0] == ()
+        store.put([Answer("late", held[0].item.id, "ann", 0.5)], held[0].id)  # her page still showed it
+
+
+def test_what_a_rater_left_behind_goes_to_others_once_her_lease_has_ended(tmp_path):
+    project = project_of(tmp_path, texts(6), ["ann", "bob", "eve"], overlap=2, repeats=0.0)
+    now = [1e9]
+    with (
+        SQLiteStore(project.folder / "answers.sqlite", clock=lambda: now[0]) as store,
+        SQLiteStore(project.folder / "answers.sqlite", clock=lambda: now[0]) as other,
+    ):
+        assert top_up(project, store, "ann", 6) == 6
+        left = {lease.item.id for lease in store.lease("ann", 4)}  # two of the six she was never shown
+        assert top_up(project, store, "bob", 9) == 6
+        answered(store, "bob", 6)
+        assert top_up(project, other, "eve", 9) == 0
+        now[0] += LEASE_SECONDS + 1
+        assert top_up(project, store, "bob", 9) == 0  # who has rated them all
+        back = store.lease("ann", 2)  # she is there again, and holds two
+        gone = top_up(project, store, "eve", 3), top_up(project, other, "eve", 9)
+        assert gone == (3, 1)
+        assert {lease.item.id for lease in back} < left
+        answered(store, "ann", 9)
+        answered(other, "eve", 9)
+        said, _ = store.answers()
+        assert Counter(a.item for a in said) == Counter({item.id: 2 for item in texts(6)})
+        assert (store.open_requests()[0], len(said)) == ((), 12)
 
 
 def test_practice_once_and_first_gold_now_and_then_and_neither_among_the_rest(tmp_path):

@@ -42,6 +42,8 @@ def top_up(
 ) -> int:
     """Ask a rater for more, and return how many requests were made; 0 if there is nothing left to ask, or too busy.
 
+    When nothing else is left, she is asked what others were asked who do not come to it (``AnswerStore.pass_on``).
+
     Examples:
         >>> import tempfile
         >>> from uard.collect.items import text_item
@@ -80,8 +82,8 @@ def top_up(
             if rater in seen.paused:
                 return 0
             requests, made = _Choice(seen, question, opened, rater, without, random).of(acquisition, count)
-            if not requests:
-                return 0
+            if not requests:  # but what others were asked who have gone
+                return store.pass_on(rater, count, seen.not_asked(question) | frozenset(without))
             if made:
                 store.add_items(made)
             if store.ask(requests, place):
@@ -161,6 +163,10 @@ class _Seen:
         if self._asked is None or self._asked[0] != question:
             self._asked = question, _askable(self, question)
         return self._asked[1]
+
+    def not_asked(self, question: Question) -> frozenset[str]:
+        """Return the items that a question is not about, or whose answer raters are told or known for."""
+        return frozenset(self.row).difference(self.askable(question).names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +261,7 @@ class _Choice:
                 continue
             if r.rater is None:
                 anybody[row] += 1
-            elif r.rater not in seen.paused:  # nobody waits for those who were sent away
+            else:  # of those who were sent away, too: what they had is passed on, and not asked of one more
                 asked[row, seen.column[r.rater]] = True
         rows = askable.rows
         if self._without:

@@ -54,6 +54,24 @@ Open, held by nobody else, not rated by her yet unless that is the point, and no
 request. A lease that ends further ahead than any lease can was given by a clock that has jumped back since.
 """
 
+LEFT_BEHIND = """
+SELECT seq, item FROM requests AS r
+WHERE answer IS NULL AND kind = 'rating' AND rater <> :rater
+  AND (coalesce(held_until, 0) < :now OR held_until > :now + :term
+       OR EXISTS (SELECT 1 FROM raters WHERE name = r.rater AND paused))
+  AND NOT EXISTS (
+        SELECT 1 FROM answers AS a WHERE a.item = r.item AND a.rater IN (:rater, r.rater)
+        AND (a.value IS NOT NULL OR a.choice IS NOT NULL)
+        AND NOT EXISTS (SELECT 1 FROM answers AS b WHERE b.supersedes = a.id))
+  AND NOT EXISTS (SELECT 1 FROM requests AS h WHERE h.item = r.item AND h.answer IS NULL
+        AND (h.rater = :rater OR h.held_by = :rater))
+ORDER BY priority DESC, seq
+"""
+"""Requests to others that a rater may take over: nobody comes to them, and she knows nothing of their items yet.
+
+What the other one has answered by another way is not asked of anybody: its place is taken.
+"""
+
 
 def prepare(db: sqlite3.Connection, path: Path) -> str:
     """Make the tables if there are none, and return the identity of the store.

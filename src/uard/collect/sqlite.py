@@ -212,9 +212,10 @@ class SQLiteStore(AnswerStore):
                 _expect(db, "items", "id", r.item, "item")
                 if r.rater is not None:
                     _expect(db, "raters", "name", r.rater, "rater")
+                until = None if r.rater is None else self._clock() + LEASE_SECONDS  # so long it is hers alone
                 db.execute(
-                    "INSERT INTO requests (item, rater, kind, priority) VALUES (?, ?, ?, ?)",
-                    (r.item, r.rater, r.kind, float(r.priority)),
+                    "INSERT INTO requests (item, rater, kind, priority, held_until) VALUES (?, ?, ?, ?, ?)",
+                    (r.item, r.rater, r.kind, float(r.priority), until),
                 )
         return len(requests)
 
@@ -250,6 +251,21 @@ class SQLiteStore(AnswerStore):
                 if row["seq"] in known:
                     db.execute("UPDATE requests SET held_until = ? WHERE seq = ?", (until, row["seq"]))
             return tuple(self._lease_of(db, row["seq"], rater) for row in found)
+
+    def pass_on(self, rater: str, count: int, without: Collection[str] = ()) -> int:
+        """See ``AnswerStore``."""
+        with self._changing() as db:
+            now = self._clock()
+            rows = db.execute(schema.LEFT_BEHIND, {"rater": rater, "now": now, "term": LEASE_SECONDS}).fetchall()
+            first = {row["item"]: row["seq"] for row in reversed(rows) if row["item"] not in without}
+            taken = [row["seq"] for row in rows if row["seq"] == first.get(row["item"])][:count]
+            for seq in taken:  # the lease that there was stays known: an answer to it is heard whenever it comes
+                db.execute(
+                    'UPDATE requests SET rater = ?, lease = NULL, held_by = NULL, held_until = ?, "left" = NULL '
+                    "WHERE seq = ?",
+                    (rater, now + LEASE_SECONDS, seq),
+                )
+        return len(taken)
 
     def leased(self, name: str) -> Lease | None:
         """See ``AnswerStore``."""

@@ -41,7 +41,8 @@ class Request:
 
     Attributes:
         item: Its name.
-        rater: Who; anybody who has not rated it yet if left out. A repeat names who rated it before.
+        rater: Who; anybody who has not rated it yet if left out. A repeat names who rated it before. A rating that she
+            does not come to for a while may be passed on to somebody else (``AnswerStore.pass_on``).
         kind: One of ``uard.ratings.table.KINDS``.
         priority: Higher ones are shown first, practice before all others.
     """
@@ -227,6 +228,20 @@ class AnswerStore(ABC):
             rater: Her name.
             count: How many at most.
             without: Names of items that are not shown, because their files are missing.
+        """
+
+    @abstractmethod
+    def pass_on(self, rater: str, count: int, without: Collection[str] = ()) -> int:
+        """Give a rater questions of others who do not come to them, and return how many.
+
+        Those are open requests of kind ``rating`` to a name whose lease has ended, or that she was not shown within the
+        time of a lease, or who is paused; of items that this rater has neither rated nor is asked about. Who had one
+        is not asked about it any more. What she says of it all the same is kept.
+
+        Args:
+            rater: Her name.
+            count: How many at most.
+            without: Names of items that are left alone.
         """
 
     @abstractmethod
