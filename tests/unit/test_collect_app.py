@@ -1,17 +1,19 @@
 """The page's routes, without a browser: who may ask what, and what is stored of it."""
 
 import json
+import os
 import subprocess
 import sys
 import threading
 import time
 import uuid
+from typing import ClassVar
 
 import pytest
 from starlette.testclient import TestClient
 
 from uard._checks import InvalidValueError
-from uard.collect import Project, Question, Request, SQLiteStore, clip_item, pair_item, text_item
+from uard.collect import Project, Question, Request, SQLiteStore, asking, clip_item, pair_item, text_item
 from uard.collect.app import create_app, security
 from uard.collect.app.security import MOST_BYTES
 from uard.collect.project import Known
@@ -23,6 +25,17 @@ HERE = "http://127.0.0.1:8321"
 TEXTS = [
     text_item("What is 2 + 2?", f"{i} <script>alert(1)</script>", reward=i / 10, stratum="model") for i in range(6)
 ]
+
+
+class Browser(TestClient):
+    """A browser; what its page sends names the page's rater and question, as a page does."""
+
+    page: ClassVar = {}
+
+    def post(self, url, *, json=None, **more):
+        if str(url).startswith("/api") and isinstance(json, dict):
+            json = self.page | json
+        return super().post(url, json=json, **more)
 
 
 class Site:
@@ -45,10 +58,15 @@ class Site:
         self.app = create_app(self.project, self.store, **self.settings)
 
     def browser(self, base=HERE, **headers):
-        return TestClient(self.app, base_url=base, headers={"Origin": base} | headers, follow_redirects=False)
+        return Browser(self.app, base_url=base, headers={"Origin": base} | headers, follow_redirects=False)
+
+    def opened(self, browser, name):
+        """Open the page of a rater in a browser."""
+        browser.page = {"rater": name, "question": self.project.question.identity}
+        return browser
 
     def rater(self, name):
-        browser = self.browser()
+        browser = self.opened(self.browser(), name)
         assert browser.post("/enter", data={"token": self.store.invite(name)}).status_code == 303
         return browser
 
@@ -100,10 +118,10 @@ def test_from_a_link_to_a_stored_answer(site):
     entered = browser.post("/enter", data={"token": secret})
     assert (entered.status_code, entered.headers["location"]) == (303, "/rate")
     cookie = entered.headers["set-cookie"]
-    for word in ("uard_rater=", "HttpOnly", "SameSite=strict", "Path=/"):
+    for word in (f"uard_rater_{site.store.identity}=", "HttpOnly", "SameSite=strict", "Path=/"):
         assert word in cookie
     assert "Secure" not in cookie
-    page = browser.get("/rate")
+    page = site.opened(browser, "ann").get("/rate")
     assert "How much reward does this deserve?" in page.text
     (task, other) = tasks(browser)
     body = answer_to(task, comment="")
@@ -135,7 +153,7 @@ def test_an_answer_that_is_sent_again_is_stored_once_even_after_a_restart(site):
     assert browser.post("/api/answers", json=body).json() == first.json()
     cookies = dict(browser.cookies)
     site.start()
-    again = site.browser()
+    again = site.opened(site.browser(), "ann")
     again.cookies.update(cookies)
     assert again.post("/api/answers", json=body).json() == first.json()
     assert len(site.rows()) == 1
@@ -144,17 +162,20 @@ def test_an_answer_that_is_sent_again_is_stored_once_even_after_a_restart(site):
     assert "another answer is stored" in differs.json()["error"]
 
 
-def test_an_answer_to_a_lease_that_a_restarted_server_does_not_know(site):
+def test_an_answer_to_a_lease_that_was_given_before_the_server_was_started_again(site):
     browser = site.rater("ann")
     first, second = tasks(browser)
     site.start()
-    again = site.browser()
+    again = site.opened(site.browser(), "ann")
     again.cookies.update(dict(browser.cookies))
-    stored = again.post("/api/answers", json=answer_to(first, item=first["item"]["id"]))
+    stored = again.post("/api/answers", json=answer_to(first))
     assert stored.status_code == 200
     assert tasks(again)[0]["lease"] == second["lease"], "the request was answered, not asked again"
-    unknown = again.post("/api/answers", json=answer_to({"lease": "f" * 32}, item=None))
-    assert unknown.status_code == 404
+    assert again.post("/api/answers", json=answer_to(first, -0.5)).status_code == 200
+    assert [(r.value, r.kind) for r in site.store.answers()[0].standing()] == [(-0.5, "rating")], "no repeat"
+    invented = answer_to({"lease": "f" * 32}, item=TEXTS[5].id)
+    assert again.post("/api/answers", json=invented).status_code == 404, "nobody has shown her that"
+    assert len(site.rows()) == 2
 
 
 def test_an_answer_after_its_lease_has_ended_and_another_rater_has_answered(tmp_path):
@@ -297,12 +318,11 @@ def test_pairs(made):
     assert ann.post("/api/answers", json=answer_to(second, choice="cannot tell")).status_code == 200
     row = site.rows()[-1]
     assert [row.left, row.right] == second["sides"]
-    named = {"item": pair.id, "left": pair.content["right"], "right": pair.content["left"]}
-    late = {"lease": "0" * 32}
-    assert bob.post("/api/answers", json=answer_to(late, choice="left") | named).status_code == 200
-    assert site.rows()[-1].left == pair.content["right"], "as it stood on the screen"
-    wrong = named | {"left": TEXTS[4].id}
-    assert site.rater("bob").post("/api/answers", json=answer_to(late, choice="left") | wrong).status_code == 400
+    (other,) = tasks(bob)
+    site.start()
+    bob = site.rater("bob")
+    assert bob.post("/api/answers", json=answer_to(other, choice="left")).status_code == 200
+    assert [site.rows()[-1].left, site.rows()[-1].right] == other["sides"], "as it stood on the screen"
 
 
 def test_thumbs_and_practice(made):
@@ -331,7 +351,8 @@ def test_more_is_asked_for_when_there_is_too_little(made):
     calls = []
     site = made(asked=TEXTS[:1])
 
-    def more(rater, count):
+    def more(rater, count, without):
+        assert without == set()
         calls.append((rater, count))
         site.store.ask([Request(i.id, rater) for i in TEXTS[1:3]])
 
@@ -399,13 +420,20 @@ def test_behind_a_server_with_tls(made):
     browser = site.browser("https://rate.example.org")
     entered = browser.post("/enter", data={"token": site.store.invite("ann")})
     assert "Secure" in entered.headers["set-cookie"]
-    assert len(tasks(browser)) == 2
+    assert len(tasks(site.opened(browser, "ann"))) == 2
     inner = site.browser("http://127.0.0.1:8321", Origin="https://rate.example.org")
     assert inner.post("/owner/login", data={"password": "open sesame"}).status_code == 303, "the name was changed"
     link = browser.post("/owner/login", data={"password": "open sesame"})
     assert link.status_code == 303
     assert browser.post("/owner/invite", json={"rater": "eve"}).json()["link"].startswith("https://rate.example.org/en")
-    for wrong in ("rate.example.org", "ftp://x", "https://x/path"):
+    for wrong in (
+        "rate.example.org",
+        "ftp://x",
+        "https://x/path",
+        "https://me:secret@x",
+        "https://x:port",
+        "https://a b",
+    ):
         with pytest.raises(InvalidValueError, match="public_url"):
             create_app(site.project, site.store, owner_password="x", public_url=wrong)
 
@@ -432,13 +460,242 @@ def test_too_many_requests(site, monkeypatch):
     assert len(tasks(other)) == 2, "each session has its own limit"
 
 
-def test_logins_are_limited(site):
-    browser = site.browser()
-    replies = [browser.post("/owner/login", data={"password": f"{i}"}) for i in range(12)]
-    assert [r.status_code for r in replies[:10]] == [403] * 10
-    assert replies[-1].status_code == 429
-    assert int(replies[-1].headers["retry-after"]) >= 1
-    assert browser.post("/owner/login", data={"password": "open sesame"}).status_code == 429
+def test_guesses_are_slow_and_the_right_password_is_always_heard(site, monkeypatch):
+    monkeypatch.setattr(security, "SLOW", 0.2)
+    browser, owner = site.browser(), site.browser()
+    replies = [browser.post("/owner/login", data={"password": f"{i}"}) for i in range(10)]
+    assert [r.status_code for r in replies] == [403] * 10
+    for login, status in ((browser, 403), (owner, 303)):
+        before = time.monotonic()
+        password = "open sesame" if login is owner else "again"
+        assert login.post("/owner/login", data={"password": password}).status_code == status
+        assert time.monotonic() - before >= 0.2
+    assert owner.get("/owner/overview").status_code == 200
+
+
+def test_a_page_of_another_rater_in_the_same_browser_speaks_for_nobody(site):
+    browser = site.rater("ann")
+    task, _ = tasks(browser)
+    browser.post("/enter", data={"token": site.store.invite("bob")})
+    body = answer_to(task)
+    for path, sent in (("next", {"count": 2}), ("answers", body), ("undo", body), ("broken", body)):
+        reply = browser.post(f"/api/{path}", json=sent)
+        assert (reply.status_code, reply.json()["why"]) == (409, "rater")
+        assert "This page is ann's, and this browser is now bob's." in reply.json()["error"]
+        assert browser.post(f"/api/{path}", json=sent | {"rater": None}).status_code == 400
+    assert site.rows() == ()
+    browser.post("/enter", data={"token": site.store.invite("ann")})
+    assert browser.post("/api/answers", json=body).status_code == 200
+    assert [r.rater for r in site.rows()] == ["ann"]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"low": -50.0, "high": 50.0},
+        {"kind": "thumbs"},
+        {"kind": "stars"},
+        {"attributes": ("safe",)},
+        {"comment": True},
+    ],
+)
+def test_a_page_that_asks_what_is_not_asked_any_more(site, changed):
+    browser = site.rater("ann")
+    first, second, _ = tasks(browser, 3)
+    kept, late = answer_to(first), answer_to(second)
+    assert browser.post("/api/answers", json=kept).status_code == 200
+    site.project = Project(site.project.folder, Question(**changed))
+    site.start()
+    after = site.browser()
+    after.page, after.cookies = browser.page, browser.cookies
+    for path, body in (("answers", late), ("next", {"count": 1})):
+        reply = after.post(f"/api/{path}", json=body)
+        assert (reply.status_code, reply.json()["why"]) == (409, "question")
+        assert after.post(f"/api/{path}", json=body | {"question": None}).status_code == 400
+    assert after.post("/api/answers", json=kept).json()["stored"] == kept["id"], "it was stored under its own scale"
+    assert [(r.value, r.scale) for r in site.rows()] == [(0.5, "slider -1..1")]
+    assert tasks(site.opened(after, "ann"))[0]["lease"] == second["lease"]
+
+
+def test_words_that_change_no_scale_leave_open_pages_alone():
+    plain = Question()
+    for same in (Question(question="Again?"), Question(stars=7), Question(overlap=9), Question(instructions="x")):
+        assert same.identity == plain.identity
+    stars = {Question(kind="stars", stars=n).identity for n in (3, 4)}
+    assert len(stars | {plain.identity, Question(high=2).identity}) == 4
+
+
+def test_answers_to_one_lease_at_once_are_one_answer(site):
+    browser = site.rater("ann")
+    task, _ = tasks(browser)
+    replies = []
+
+    def tell(value):
+        own = site.opened(site.browser(), "ann")
+        own.cookies.update(dict(browser.cookies))
+        replies.append(own.post("/api/answers", json=answer_to(task, value)).status_code)
+
+    threads = [threading.Thread(target=tell, args=(k / 8,)) for k in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert replies == [200] * 8
+    (row,) = site.store.answers()[0].standing()
+    assert row.kind == "rating"
+    undone = browser.post("/api/undo", json={"id": uuid.uuid4().hex, "answer": row.id}).json()
+    assert undone["task"] == task, "whichever tab has said it last"
+
+
+def test_two_projects_of_one_host_do_not_log_each_other_out(made):
+    one, other = made(), made()
+    jars = [browser.cookies for s in (one, other) for browser in (s.rater("ann"), s.owner())]
+    cookies = {name: value for jar in jars for name, value in jar.items()}
+    assert len(cookies) == 4
+    for site in (one, other):
+        browser = site.opened(site.browser(), "ann")
+        browser.cookies.update(cookies)
+        assert len(tasks(browser)) == 2
+        assert browser.get("/owner/overview").status_code == 200
+        assert site.store.identity in browser.get("/rate").text
+
+
+def test_what_a_browser_cannot_show_is_left_out_for_its_rater_and_then_for_all(made):
+    site = made(question=Question(overlap=2), asked=[])
+
+    def more(*rest):
+        asking.top_up(site.project, site.store, *rest)
+
+    site.settings["top_up"] = more
+    site.start()
+    ann, bob = site.rater("ann"), site.rater("bob")
+    wrong = {TEXTS[k].id for k in range(3)}
+    done = set()
+    for _ in range(20):
+        for task in tasks(ann, 4):
+            path = "broken" if task["item"]["id"] in wrong else "answers"
+            assert ann.post(f"/api/{path}", json=answer_to(task)).status_code == 200
+            done |= {task["item"]["id"]} if path == "answers" else set()
+    assert done == {t.id for t in TEXTS} - wrong, "she goes on with all others"
+    assert ann.post("/api/next", json={"count": 2}).json()["progress"] == {"answered": 3, "open": 0}
+    owner = site.owner()
+    assert "3 items that a browser cannot show" in owner.get("/owner").text
+    shown = tasks(bob, 20)
+    assert wrong <= {t["item"]["id"] for t in shown}, "others are asked until it is seen not to be hers alone"
+    (task,) = [t for t in shown if t["item"]["id"] == TEXTS[0].id]
+    assert bob.post("/api/broken", json={"lease": task["lease"], "item": TEXTS[5].id}).status_code == 404
+    assert ann.post("/api/broken", json={"lease": task["lease"]}).status_code == 403
+    assert bob.post("/api/broken", json={"lease": task["lease"]}).status_code == 200
+    page = owner.get("/owner").text
+    assert "1 item set aside" in page
+    assert "the browsers of ann, bob cannot show it" in page
+    assert owner.get("/owner/overview").json()["items"] == 5
+
+
+def test_progress_is_about_the_same_things_on_both_pages(made):
+    question = Question(
+        overlap=2,
+        practice=(Known(TEXTS[0].id, 0.5),),
+        examples=(Known(TEXTS[1].id, 0.5),),
+        gold=(Known(TEXTS[2].id, 0.5),),
+    )
+    site = made(question=question, asked=TEXTS[3:])
+    kinds = [Request(TEXTS[0].id, "ann", "practice"), Request(TEXTS[2].id, "ann", "gold")]
+    site.store.ask(kinds)
+    ann, owner = site.rater("ann"), site.owner()
+    assert ann.post("/api/next", json={"count": 1}).json()["progress"] == {"answered": 0, "open": 4}
+    while shown := tasks(ann, 1):
+        skip = {"choice": "skip"} if shown[0]["item"]["id"] == TEXTS[5].id else {}
+        ann.post("/api/answers", json=answer_to(shown[0], **skip))
+    site.store.ask([Request(TEXTS[3].id, "ann", "repeat")])
+    ann.post("/api/answers", json=answer_to(tasks(ann, 1)[0]))
+    reply = ann.post("/api/next", json={"count": 1}).json()
+    assert reply["progress"] == {"answered": 5, "open": 0}, "three items, a repeat and gold"
+    names = ("items", "rated", "complete", "answers", "wanted")
+    assert [owner.get("/owner/overview").json()[n] for n in names] == [3, 3, 0, 3, 6]
+    bob = site.rater("bob")
+    for task in tasks(bob, 20):
+        bob.post("/api/answers", json=answer_to(task))
+    assert [owner.get("/owner/overview").json()[n] for n in names] == [3, 3, 3, 6, 6]
+
+
+def test_a_rater_who_is_given_nothing_is_told_of_nothing(made):
+    site = made(asked=[])
+    reply = site.rater("ann").post("/api/next", json={"count": 2}).json()
+    assert (reply["tasks"], reply["progress"]) == ([], {"answered": 0, "open": 0})
+
+
+HALF = "\ud800"
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({name: HALF} for name in ("id", "lease", "choice", "source", "rater", "question")),
+        {"values": {HALF: 1.0}},
+        {"values": {"": [HALF]}},
+        {HALF: 1},
+    ],
+)
+def test_half_a_character_is_refused_anywhere(site, wrong):
+    browser, owner = site.rater("ann"), site.owner()
+    body = answer_to(tasks(browser)[0]) | browser.page
+    for path in ("next", "answers", "undo", "broken"):
+        assert_refused(browser, f"/api/{path}", json.dumps(body | wrong))
+    for path in ("login", "invite", "end", "pause", "retract"):
+        sent = {"password": HALF, "rater": HALF, "answer": HALF}
+        assert_refused(owner, f"/owner/{path}", json.dumps(sent))
+    assert_refused(browser, "/enter", json.dumps({"token": HALF}))
+
+
+@pytest.mark.parametrize("number", ["1e400", "-1e400", "9" * 400, "9" * 5000, "NaN", "Infinity"])
+@pytest.mark.parametrize("field", ["seconds", "count", "values"])
+def test_numbers_that_nobody_can_store(site, field, number):
+    browser = site.rater("ann")
+    body = json.dumps(answer_to(tasks(browser)[0]) | browser.page | {field: "here"})
+    for path in ("next", "answers"):
+        assert_refused(browser, f"/api/{path}", body.replace('"here"', number))
+    assert site.rows() == ()
+
+
+def assert_refused(browser, path, content):
+    reply = browser.post(path, content=content, headers={"Content-Type": "application/json"})
+    assert reply.status_code == 400, (path, reply.text)
+    assert reply.json()["error"]
+
+
+def test_half_a_character_in_a_comment_loses_no_answer(made):
+    site = made(question=Question(comment=True))
+    browser = site.rater("ann")
+    content = json.dumps(answer_to(tasks(browser)[0], comment=f"fine {HALF}") | browser.page)
+    assert browser.post("/api/answers", content=content, headers={"Content-Type": "application/json"}).is_success
+    assert site.rows()[0].comment == "fine ?"
+
+
+def test_the_owner_ends_the_sessions_of_a_rater(site):
+    ann, owner = site.rater("ann"), site.owner()
+    assert "End the sessions of ann" in owner.get("/owner").text
+    assert owner.post("/owner/end", json={"rater": "eve"}).status_code == 404
+    link = owner.post("/owner/end", json={"rater": "ann"}).json()["link"]
+    assert ann.post("/api/next", json={"count": 1}).status_code == 401
+    assert ann.post("/enter", data={"token": link.rsplit("/", 1)[1]}).status_code == 303
+    assert len(tasks(ann)) == 2
+
+
+@pytest.mark.parametrize(
+    ("given", "origin", "host"),
+    [
+        ("https://rate.example.org:443/", "https://rate.example.org", "rate.example.org"),
+        ("https://Rate.Example.org", "https://rate.example.org", "rate.example.org:443"),
+        ("http://bücher.example:8080", "http://xn--bcher-kva.example:8080", "xn--bcher-kva.example:8080"),
+    ],
+)
+def test_a_public_address_in_another_spelling(made, given, origin, host):
+    site = made(public_url=given)
+    browser = site.browser(origin)
+    login = browser.post("/owner/login", data={"password": "open sesame"}, headers={"Host": host})
+    assert login.status_code == 303
+    assert browser.post("/owner/invite", json={"rater": "eve"}).json()["link"].startswith(f"{origin}/enter/")
 
 
 @pytest.mark.parametrize(("error", "status"), [("database or disk is full", 507), ("disk I/O error", 503)])
@@ -607,6 +864,28 @@ def test_another_host_needs_tls(tmp_path):
         serve(project.folder, host="0.0.0.0")
     with pytest.raises(InvalidValueError, match="public_url"):
         serve(project.folder, host="0.0.0.0", public_url="rate.example.org")
+
+
+@pytest.mark.skipif(sys.platform == "win32" or os.geteuid() == 0, reason="nothing is forbidden to this user")
+def test_a_folder_that_cannot_be_written_to(tmp_path):
+    project = Project.create(tmp_path / "walk")
+    project.folder.chmod(0o500)
+    try:
+        with pytest.raises(InvalidValueError, match="in a folder that can be written to"):
+            serve(project.folder, port=0)
+    finally:
+        project.folder.chmod(0o700)
+
+
+def test_a_lock_that_cannot_be_opened_and_media_that_are_no_folder(tmp_path):
+    project = Project.create(tmp_path / "walk")
+    (project.folder / "serving.lock").mkdir()
+    with pytest.raises(InvalidValueError, match="in a folder that can be written to"):
+        serve(project.folder, port=0)
+    (project.folder / "media").rmdir()
+    (project.folder / "media").write_bytes(b"")
+    with pytest.raises(InvalidValueError, match="must be a folder"):
+        serve(project.folder, port=0)
 
 
 def test_a_new_start_leaves_links_that_were_given_out_as_they_are(tmp_path):

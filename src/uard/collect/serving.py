@@ -13,10 +13,10 @@ from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
-from urllib.parse import urlsplit
 
 from uard import _checks
 from uard.collect import asking
+from uard.collect.address import origin_of
 from uard.collect.project import Project
 from uard.collect.store import AnswerStore
 
@@ -35,7 +35,7 @@ def serve(
     public_url: str | None = None,
     owner_password: str | None = None,
     new_links: bool = False,
-    top_up: Callable[[Project, AnswerStore], Callable[[str, int], None]] | None = None,
+    top_up: Callable[[Project, AnswerStore], Callable[[str, int, Collection[str]], None]] | None = None,
     say: Callable[[str], None] = print,
 ) -> None:
     """Serve a project until SIGINT or SIGTERM.
@@ -58,7 +58,7 @@ def serve(
         StoreError: the store cannot be opened.
         ModuleNotFoundError: the extra ``uard[collect]`` is not installed.
     """
-    _check_host(host, public_url)
+    public = _checked(host, public_url)
     _checks.whole("port", port, low=0, high=65_535)
     uvicorn: Any = _uvicorn()
     from uard.collect.app import create_app
@@ -71,22 +71,20 @@ def serve(
         with project.store() as store:
             wrong = project.damaged(store.items()[0])
             _tell_damage(wrong, say)
-            more = _asking(project, store, wrong) if top_up is None else top_up(project, store)
-            app = create_app(project, store, owner_password=password, public_url=public_url, top_up=more)
-            url = (public_url or address).rstrip("/")
+            more = _asking(project, store) if top_up is None else top_up(project, store)
+            app = create_app(project, store, owner_password=password, public_url=public, top_up=more)
+            url = public or address
             links = invite(store, raters, new_links)
             for rater, secret in links:
                 say(f"{rater}: {url}/enter/{secret}")
             _tell_known(store, [rater for rater, _ in links], say)
             say(f"owner: {url}/owner" + ("" if owner_password else f"  (password {password})"))
             say("Each link works once. Ctrl-C ends the server; every answer that was acknowledged is kept.")
-            _run(uvicorn, app, listener, behind=public_url is not None)
+            _run(uvicorn, app, listener, behind=public is not None)
 
 
-def _asking(project: Project, store: AnswerStore, wrong: Mapping[str, str]) -> Callable[[str, int], None]:
-    without = frozenset(wrong)
-
-    def more(rater: str, count: int) -> None:
+def _asking(project: Project, store: AnswerStore) -> Callable[[str, int, Collection[str]], None]:
+    def more(rater: str, count: int, without: Collection[str]) -> None:
         asking.top_up(project, store, rater, count, without)
 
     return more
@@ -149,15 +147,15 @@ def _run(uvicorn: Any, app: Any, listener: socket.socket, behind: bool) -> None:
         uvicorn.Server(config).run(sockets=[listener])
 
 
-def _check_host(host: str, public_url: str | None) -> None:
+def _checked(host: str, public_url: str | None) -> str | None:
+    """Return the public address in the spelling of browsers; refuse a host that needs one and has none."""
     if not is_local(host) and public_url is None:
         allowed = (
             "127.0.0.1, or together with public_url: answers and links must not cross a network without TLS, "
             "and docs/guides/people.md says how to put a server with TLS before this one"
         )
         raise _checks.InvalidValueError("host", host, allowed)
-    if public_url is not None and (urlsplit(public_url).scheme not in ("http", "https")):
-        raise _checks.InvalidValueError("public_url", public_url, "an address such as https://rate.example.org")
+    return None if public_url is None else origin_of(public_url)
 
 
 def is_local(host: str) -> bool:
@@ -204,7 +202,7 @@ def _what_port(error: OSError, host: str) -> str:
 def _alone(folder: Path) -> Generator[Callable[[str], None]]:
     """Hold the project's lock, which ends with the process, however that ends; what is yielded tells the address."""
     path = folder / LOCK
-    with path.open("a+b") as file:
+    with _opened(path) as file:
         if not _lock(file):
             raise _checks.InvalidValueError("project", str(folder), f"served once, and {_first(path)}")
 
@@ -217,6 +215,14 @@ def _alone(folder: Path) -> Generator[Callable[[str], None]]:
             yield announce
         finally:
             file.truncate(0)
+
+
+def _opened(path: Path) -> BinaryIO:
+    try:
+        return path.open("a+b")
+    except OSError as error:
+        allowed = f"in a folder that can be written to ({error.strerror})"
+        raise _checks.InvalidValueError("project", str(path.parent), allowed) from None
 
 
 def _first(path: Path) -> str:

@@ -220,9 +220,10 @@ class Simulation:
     def _visit(
         self, visitor: Visitor, known: _Contents, place: int, name: str, done: list[str], stop: threading.Event
     ) -> None:
+        page = {"rater": name, "question": self.project.question.identity}
         last = time.monotonic()
         while not stop.is_set() and (self.most is None or len(done) < self.most):
-            tasks = visitor.ask("/api/next", {"count": 2})["tasks"]
+            tasks = visitor.ask("/api/next", page | {"count": 2})["tasks"]
             if not tasks:
                 if time.monotonic() - last > self.idle:
                     return
@@ -232,10 +233,7 @@ class Simulation:
                 random = self._random(task, name)
                 sides = task.get("sides") or [task["item"]["id"]]
                 said = self.said([known[x] for x in sides], place, random)
-                # The item, too: a server that was killed has forgotten its leases.
-                answer = {"id": self._id(task, name), "lease": task["lease"], "item": task["item"]["id"]} | said
-                if len(sides) == 2:
-                    answer |= {"left": sides[0], "right": sides[1]}
+                answer = page | {"id": self._id(task, name), "lease": task["lease"]} | said
                 answer |= {"comment": "", "seconds": 1.0}
                 done.append(visitor.answer(answer)["stored"])
                 last = time.monotonic()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import cast
 
 try:
@@ -19,12 +19,13 @@ except ModuleNotFoundError as error:
     ) from None
 
 from uard._checks import InvalidValueError
+from uard.collect.address import origin_of
 from uard.collect.app.memory import Book, Catalogue
 from uard.collect.app.owner import OwnerRoutes
 from uard.collect.app.pages import STATIC, refusal
 from uard.collect.app.rating import RaterRoutes
-from uard.collect.app.security import Guard, OwnerDoor, Sessions, origin_of, trouble
-from uard.collect.app.site import Site
+from uard.collect.app.security import Cookies, Guard, OwnerDoor, Sessions, trouble
+from uard.collect.app.site import PageError, Site
 from uard.collect.project import Project
 from uard.collect.store import AnswerStore, ConflictError, LinkUsedError, StoreError
 
@@ -37,7 +38,7 @@ def create_app(
     *,
     owner_password: str,
     public_url: str | None = None,
-    top_up: Callable[[str, int], None] | None = None,
+    top_up: Callable[[str, int, Collection[str]], None] | None = None,
 ) -> Starlette:
     """Return the application that serves a project.
 
@@ -46,7 +47,7 @@ def create_app(
         >>> with tempfile.TemporaryDirectory() as folder, Project.create(folder).store() as store:
         ...     app = create_app(Project.open(folder), store, owner_password="open sesame")
         ...     len(app.routes)
-        18
+        20
 
     Args:
         project: Its folder and question.
@@ -54,18 +55,17 @@ def create_app(
         owner_password: For the page ``/owner``.
         public_url: The address that raters see, such as ``https://rate.example.org``, where another server stands
             before this one; without it only names of this machine are answered to.
-        top_up: Called with a rater's name and a number when there is less for her to rate than her page asks for, so
-            that more can be requested.
+        top_up: Called with a rater's name, a number and the names of items that she is not to be asked about, when
+            there is less for her to rate than her page asks for, so that more can be requested.
 
     Raises:
         InvalidValueError: the password is empty, or the address is none.
         StoreError: the store cannot be read.
     """
-    if public_url is not None:
-        origin_of(public_url)
-    sessions, owner = Sessions(store), OwnerDoor(owner_password)
-    site = Site(project, store, Catalogue(project, store), Book(store), sessions, owner, public_url, top_up)
-    guard = Middleware(Guard, sessions=sessions, owner=owner, public_url=public_url)
+    public = None if public_url is None else origin_of(public_url)
+    sessions, owner, cookies = Sessions(store), OwnerDoor(owner_password), Cookies.of(store.identity)
+    site = Site(project, store, Catalogue(project, store), Book(store), sessions, owner, cookies, public, top_up)
+    guard = Middleware(Guard, sessions=sessions, owner=owner, cookies=cookies, public_url=public)
     static = Mount("/static", StaticFiles(directory=STATIC), name="static")
     return Starlette(
         routes=[*RaterRoutes(site).routes(), *OwnerRoutes(site).routes(), static],
@@ -83,7 +83,8 @@ def create_app(
 async def _http(request: Request, error: Exception) -> Response:
     known = cast("HTTPException", error)
     sentence = "There is no such page." if known.detail == "Not Found" else known.detail
-    return refusal(request.scope, known.status_code, sentence, dict(known.headers or {}))
+    why = known.why if isinstance(known, PageError) else None
+    return refusal(request.scope, known.status_code, sentence, dict(known.headers or {}), why)
 
 
 async def _store(request: Request, error: Exception) -> Response:

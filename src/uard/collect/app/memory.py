@@ -1,18 +1,16 @@
-"""What the server keeps in memory of a store: items, answers and leases, read anew only as far as they are new."""
+"""What the server keeps in memory of a store: items and answers, read anew only as far as they are new."""
 
 from __future__ import annotations
 
 import threading
-from collections import Counter, OrderedDict, defaultdict
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections import Counter, defaultdict
 
 from uard.collect.items import Item
 from uard.collect.project import MOST_ATTRIBUTES, Project
-from uard.collect.store import AnswerStore, Lease
+from uard.collect.store import AnswerStore, part_name
 from uard.ratings.table import Answer, Answers
 
-MOST_LEASES = 100_000  # remembered; of older ones the store is asked
+REPORTS = 2  # raters whose browsers cannot show an item, then nobody is shown it
 
 
 class Catalogue:
@@ -38,7 +36,12 @@ class Catalogue:
         self._items: dict[str, Item] = {}
         self._using: defaultdict[str, set[str]] = defaultdict(set)  # names of files and of a pair's items
         self._wrong: dict[str, str] = {}
-        self._number: Counter[bool] = Counter()  # of pairs and others
+        self._reports: defaultdict[str, set[str]] = defaultdict(set)  # by item, raters who could not see it
+        question = project.question
+        self._pairs = question.kind == "pairs"
+        self._known = {known.item for known in (*question.practice, *question.gold, *question.examples)}
+        self._earnest: set[str] = set()
+        self._unfit: set[str] = set()
         self._after = 0
         self.refresh()
 
@@ -50,7 +53,10 @@ class Catalogue:
                 for name in (*item.media, *_sides(item)):
                     self._using[name].add(item.id)
                 self._items[item.id] = item
-                self._number[item.kind == "pair"] += 1
+                if (item.kind == "pair") != self._pairs:
+                    self._unfit.add(item.id)
+                elif item.id not in self._known:
+                    self._earnest.add(item.id)
             self._set_aside(self._project.damaged(new))
             self._set_aside({i.id: self._wrong[name] for i in new for name in _sides(i) if name in self._wrong})
 
@@ -66,19 +72,39 @@ class Catalogue:
         with self._lock:
             return dict(self._items)
 
-    def number(self, pairs: bool) -> int:
-        """Return how many pairs, or how many other items, can be shown."""
+    def earnest(self) -> set[str]:
+        """Return the names of what the question is asked about in earnest: no practice, gold or examples."""
         with self._lock:
-            kinds = Counter(self._items[name].kind == "pair" for name in self._wrong if name in self._items)
-            return self._number[pairs] - kinds[pairs]
+            return self._earnest - self._wrong.keys()
 
     def wrong(self) -> dict[str, str]:
-        """Return which items are set aside, and why."""
-        return dict(self._wrong)
+        """Return which items are set aside for everybody, and why."""
+        with self._lock:
+            return dict(self._wrong)
 
-    def aside(self) -> frozenset[str]:
-        """Return the names of items that nobody is shown, because their files are missing or were changed."""
-        return frozenset(self._wrong)
+    def reported(self) -> dict[str, str]:
+        """Return which items are set aside for some raters only, and for whom."""
+        with self._lock:
+            return {name: ", ".join(sorted(who)) for name, who in self._reports.items() if name not in self._wrong}
+
+    def aside(self, rater: str | None = None) -> frozenset[str]:
+        """Return the names of items that a rater is not shown.
+
+        Their files are missing or were changed, the question is not asked about such items, or her browser could not
+        show them.
+        """
+        with self._lock:
+            own = {name for name, who in self._reports.items() if rater in who}
+            pairs = {pair for name in own for pair in self._using.get(name, ())}
+            return frozenset(self._unfit.union(self._wrong, own, pairs))
+
+    def report(self, name: str, rater: str) -> None:
+        """Set aside for a rater what her browser cannot show, and for everybody if it is not hers alone."""
+        with self._lock:
+            who = self._reports[name]
+            who.add(rater)
+            if len(who) >= REPORTS:
+                self._set_aside({name: f"the browsers of {', '.join(sorted(who))} cannot show it"})
 
     def missing(self, file: str) -> None:
         """Set aside what needs a file that is not there any more."""
@@ -174,62 +200,3 @@ class Book:
         """Return the items that have been rated by as many as should."""
         with self._lock:
             return {item for item, raters in self._raters.items() if raters >= overlap}
-
-
-def part_name(name: str, number: int) -> str:
-    """Return the name of an answer's part: the question itself is 0, its attributes are counted from 1.
-
-    Examples:
-        >>> part_name("a1", 0), part_name("a1", 2)
-        ('a1', 'a1.2')
-    """
-    return f"{name}.{number}" if number else name
-
-
-@dataclass
-class Held:
-    """What is remembered of a lease.
-
-    Attributes:
-        rater: Whose it is.
-        item: The item's name.
-        kind: Of the request.
-        left: Of a pair, the item on the left.
-        answer: What it was answered with last, if it was.
-    """
-
-    rater: str
-    item: str
-    kind: str
-    left: str | None
-    answer: str | None = None
-
-
-class Leases:
-    """The leases that this server has handed out, those that have ended since included.
-
-    Examples:
-        >>> from uard.collect import text_item
-        >>> leases = Leases()
-        >>> leases.keep([Lease("l1", text_item("2 + 2?", "4"), "ann", "rating", 0.0)])
-        >>> leases.find("l1").rater, leases.find("l2")
-        ('ann', None)
-    """
-
-    def __init__(self) -> None:
-        """Begin with none."""
-        self._lock = threading.Lock()
-        self._held: OrderedDict[str, Held] = OrderedDict()
-
-    def keep(self, leases: Iterable[Lease]) -> None:
-        """Remember leases; of one that is known, what it was answered with stays."""
-        with self._lock:
-            for lease in leases:
-                if lease.id not in self._held:
-                    self._held[lease.id] = Held(lease.rater, lease.item.id, lease.kind, lease.left)
-            while len(self._held) > MOST_LEASES:
-                self._held.popitem(last=False)
-
-    def find(self, name: str) -> Held | None:
-        """Return a lease; None if it is not remembered."""
-        return self._held.get(name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from statistics import median
 
@@ -47,7 +47,7 @@ class RaterRow:
         name: As she was invited.
         answers: That stand, without practice.
         skipped: Of them, those that say nothing of the item.
-        coverage: Share of the items that she has rated.
+        coverage: Share of the items asked about in earnest that she has answered.
         seconds: Median time of an answer; None without answers.
         quick: Share of answers that took less than ``QUICK``.
         left: Share of the screen's left side among her preferences; None where there are no pairs.
@@ -107,11 +107,11 @@ class Overview:
     """All numbers of the owner's page.
 
     Attributes:
-        items: That can be asked about.
-        rated: Items with at least one answer.
-        complete: Items with as many raters as there should be.
-        answers: That stand, without practice.
-        wanted: Answers that there should be.
+        items: That are asked about in earnest: no practice, gold or examples, and nothing that is set aside.
+        rated: Of these items, those with at least one answer; that somebody would not say is one, too.
+        complete: Of these items, those with as many raters as there should be.
+        answers: Of these items, how many raters have answered each, counted no further than there should be.
+        wanted: How many that should become: ``answers`` is as many when all items are complete.
         seconds: Median time of an answer.
         raters: One by one.
         strata: All items together first, then part by part.
@@ -157,7 +157,12 @@ def worth(answer: Answer, item: Item | None) -> float | None:
 
 
 def overview(
-    answers: Answers, items: Mapping[str, Item], question: Question, raters: Sequence[str] = (), answered: str = ""
+    answers: Answers,
+    items: Mapping[str, Item],
+    question: Question,
+    raters: Sequence[str] = (),
+    answered: str = "",
+    without: Collection[str] = (),
 ) -> Overview:
     """Return what the owner sees.
 
@@ -174,23 +179,27 @@ def overview(
         question: What raters are asked.
         raters: Who was invited; those who have answered are added.
         answered: Which of the attributes the numbers are about.
+        without: Items that nobody is asked about any more.
     """
-    asked = {name for name, item in items.items() if (item.kind == "pair") == (question.kind == "pairs")}
+    known = {k.item for k in (*question.practice, *question.gold, *question.examples)}.union(without)
+    paired = question.kind == "pairs"
+    asked = {name for name, item in items.items() if (item.kind == "pair") == paired and name not in known}
     standing = [a for a in answers.standing() if a.kind != "practice" and a.attribute == answered]
     log = _log(standing, items)
     panel = summary(log) if log is not None and question.kind != "pairs" else None
     raters_of: defaultdict[str, set[str]] = defaultdict(set)
     for a in standing:
-        raters_of[a.item].add(a.rater)
+        if a.item in asked:
+            raters_of[a.item].add(a.rater)
     names = dict.fromkeys((*raters, *(a.rater for a in standing)))
     return Overview(
         items=len(asked),
         rated=len(raters_of),
         complete=sum(len(who) >= question.overlap for who in raters_of.values()),
-        answers=len(standing),
+        answers=sum(min(len(who), question.overlap) for who in raters_of.values()),
         wanted=len(asked) * question.overlap,
         seconds=_median(standing),
-        raters=tuple(_rater(name, standing, items, question, len(asked), panel) for name in names),
+        raters=tuple(_rater(name, standing, items, question, asked, panel) for name in names),
         strata=_strata(log, items),
         effective=None if panel is None else panel.effective,
         against="" if panel is None else panel.against,
@@ -219,7 +228,7 @@ def _rater(
     standing: Sequence[Answer],
     items: Mapping[str, Item],
     question: Question,
-    asked: int,
+    asked: Set[str],
     panel: PanelSummary | None,
 ) -> RaterRow:
     own = [a for a in standing if a.rater == name]
@@ -230,7 +239,7 @@ def _rater(
         name,
         answers=len(own),
         skipped=sum(a.choice in ("skip", "cannot tell") for a in own),
-        coverage=len({a.item for a in own}) / asked if asked else 0.0,
+        coverage=len({a.item for a in own} & asked) / len(asked) if asked else 0.0,
         seconds=_median(own),
         quick=sum(quick) / len(quick) if quick else None,
         left=sides.count("left") / len(sides) if sides else None,

@@ -17,10 +17,9 @@ from starlette.routing import Route
 
 from uard.collect.app.overview import Disputed, Overview, overview
 from uard.collect.app.pages import page, wants_json
-from uard.collect.app.rating import taken_back
-from uard.collect.app.security import OWNER, OWNER_SECONDS, origin_of
+from uard.collect.app.security import OWNER_SECONDS
 from uard.collect.app.site import Site, body_of
-from uard.collect.store import RaterState
+from uard.collect.store import taken_back
 from uard.ratings import export
 
 AGE = 5.0  # seconds for which the numbers may be old while answers come in
@@ -41,7 +40,7 @@ class OwnerRoutes:
         """Make them for a site."""
         self._site = site
         self._lock = threading.Lock()
-        self._seen: tuple[int, float, tuple[RaterState, ...], Overview] | None = None
+        self._seen: tuple[int, float, object, Overview] | None = None
 
     def routes(self) -> list[Route]:
         """Return them."""
@@ -52,6 +51,7 @@ class OwnerRoutes:
             Route("/owner/overview", self.numbers),
             Route("/owner/disputed", self.disputed),
             Route("/owner/invite", self.invite, methods=["POST"]),
+            Route("/owner/end", self.end, methods=["POST"]),
             Route("/owner/pause", self.pause, methods=["POST"]),
             Route("/owner/retract", self.retract, methods=["POST"]),
             Route("/owner/export/{name}", self.export),
@@ -74,6 +74,7 @@ class OwnerRoutes:
             seen=seen,
             states=states,
             aside=site.items.wrong(),
+            reported=site.items.reported(),
             files=files,
             disputed=[self._told(d) for d in seen.disputed],
             link=link,
@@ -86,31 +87,34 @@ class OwnerRoutes:
         site = self._site
         with self._lock:
             answers, raters, now = site.book.all(), site.store.raters(), time.monotonic()
+            aside = site.items.wrong()
+            others = raters, aside
             if self._seen is not None:
                 number, at, who, seen = self._seen
-                if who == raters and (number == len(answers) or now - at < AGE):
+                if who == others and (number == len(answers) or now - at < AGE):
                     return seen
             names = [r.name for r in raters]
-            seen = overview(answers, site.items.all(), site.question, names)
-            self._seen = len(answers), time.monotonic(), raters, seen
+            seen = overview(answers, site.items.all(), site.question, names, without=aside)
+            self._seen = len(answers), time.monotonic(), others, seen
             return seen
 
-    def login(self, request: Request) -> Response:
+    async def login(self, request: Request) -> Response:
         """Exchange the password for a cookie."""
-        cookie = self._site.owner.enter(str(body_of(request).get("password", "")))
+        cookie = await self._site.owner.enter_in_turn(str(body_of(request).get("password", "")))
         if cookie is None:
             if wants_json(request.scope):
                 raise HTTPException(403, "This is not the owner's password.")
             return page("login.html.j2", 403, project=self._site.name, wrong=True)
         response = RedirectResponse("/owner", 303)
-        self._site.set_cookie(response, OWNER, cookie, OWNER_SECONDS)
+        self._site.set_cookie(response, self._site.cookies.owner, cookie, OWNER_SECONDS)
         return response
 
     def logout(self, request: Request) -> Response:
         """Forget the owner's cookie."""
-        self._site.owner.leave(request.cookies.get(OWNER))
+        name = self._site.cookies.owner
+        self._site.owner.leave(request.cookies.get(name))
         response = RedirectResponse("/owner", 303)
-        response.delete_cookie(OWNER, path="/")
+        response.delete_cookie(name, path="/")
         return response
 
     def numbers(self, request: Request) -> Response:
@@ -140,16 +144,26 @@ class OwnerRoutes:
     def invite(self, request: Request) -> Response:
         """Make a rater's link, which is shown once."""
         _only_the_owner(request)
-        site, rater = self._site, str(body_of(request).get("rater", "")).strip()
-        link = f"{self._origin(request)}/enter/{site.store.invite(rater)}"
+        return self._invited(request, str(body_of(request).get("rater", "")).strip(), end_sessions=False)
+
+    def end(self, request: Request) -> Response:
+        """Forget all browsers of a rater, and make her a new link."""
+        _only_the_owner(request)
+        rater = str(body_of(request).get("rater", ""))
+        if rater not in {r.name for r in self._site.store.raters()}:
+            raise HTTPException(404, "There is no such rater.")
+        return self._invited(request, rater, end_sessions=True)
+
+    def _invited(self, request: Request, rater: str, end_sessions: bool) -> Response:
+        site = self._site
+        link = f"{self._origin(request)}/enter/{site.store.invite(rater, end_sessions=end_sessions)}"
         site.sessions.forget()
         if wants_json(request.scope):
             return JSONResponse({"rater": rater, "link": link})
         return self._page((rater, link))
 
     def _origin(self, request: Request) -> str:
-        public = self._site.public_url
-        return origin_of(public) if public else f"http://{request.headers['host']}"
+        return self._site.public_url or f"http://{request.headers['host']}"
 
     def pause(self, request: Request) -> Response:
         """Show a rater nothing more, or go on."""

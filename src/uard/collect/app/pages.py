@@ -71,10 +71,12 @@ def page(name: str, status: int = 200, **values: Any) -> HTMLResponse:
     return HTMLResponse(render(name, **values), status, {"Referrer-Policy": "same-origin"})
 
 
-def refusal(scope: Scope, status: int, sentence: str, headers: dict[str, str] | None = None) -> Response:
-    """Return an error as JSON for programs and as a page for people."""
+def refusal(
+    scope: Scope, status: int, sentence: str, headers: dict[str, str] | None = None, why: str | None = None
+) -> Response:
+    """Return an error as JSON for programs, with a word for those that can do something, and as a page for people."""
     if wants_json(scope):
-        return JSONResponse({"error": sentence}, status, headers)
+        return JSONResponse({"error": sentence} | ({"why": why} if why else {}), status, headers)
     title = TITLES.get(status, "Something went wrong")
     html = render("message.html.j2", title=title, sentence=sentence)
     return HTMLResponse(html, status, headers)

@@ -9,8 +9,10 @@ import logging
 import secrets
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from http.cookies import CookieError, SimpleCookie
+from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from starlette.concurrency import run_in_threadpool
@@ -18,17 +20,18 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from uard import _checks
+from uard.collect.address import PORTS, origin_of
 from uard.collect.app.pages import refusal
 from uard.collect.store import AnswerStore, StoreError, hashed
 
-RATER, OWNER = "uard_rater", "uard_owner"  # cookies
 MOST_BYTES = 64 * 1024  # of a request's body
 BODY_SECONDS = 30.0  # in which it must have arrived
 FRESH = 0.5  # seconds for which the list of raters may be old; the owner's own changes act at once
 OWNER_SECONDS = 12 * 3600.0  # until the owner logs in again
 PER_SESSION = (200.0, 400.0)  # requests per second, and at once: as fast as any rater or simulated one
 PER_ADDRESS = (20.0, 400.0)  # of those without a session: fifty raters who open their links in one moment
-LOGINS = (1 / 6, 10.0)
+WRONG_LOGINS = (10, 60.0)  # wrong passwords in so many seconds, then each login takes
+SLOW = 1.0  # second, one after the other
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-action 'self'",
     "X-Content-Type-Options": "nosniff",
@@ -36,6 +39,28 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
+
+
+class Cookies(NamedTuple):
+    """Names of cookies; of each project others, for a browser sends those of all ports of a host to each of them.
+
+    Attributes:
+        rater: By which a rater's browser is known.
+        owner: By which the owner's is.
+    """
+
+    rater: str
+    owner: str
+
+    @staticmethod
+    def of(identity: str) -> Cookies:
+        """Return the names for a project.
+
+        Examples:
+            >>> Cookies.of("c0ffee").rater
+            'uard_rater_c0ffee'
+        """
+        return Cookies(f"uard_rater_{identity}", f"uard_owner_{identity}")
 
 
 class Buckets:
@@ -136,10 +161,25 @@ class OwnerDoor:
         self._password = password.encode()
         self._clock = clock
         self._until: dict[str, float] = {}
+        self._wrong: deque[float] = deque(maxlen=WRONG_LOGINS[0])
+        self._turn = asyncio.Lock()
+
+    async def enter_in_turn(self, password: str) -> str | None:
+        """Return as ``enter`` does, but slowly while somebody guesses.
+
+        Nobody is locked out, for whoever guesses may share the owner's address: the right password is always heard.
+        """
+        number, seconds = WRONG_LOGINS
+        if len(self._wrong) == number and self._clock() - self._wrong[0] < seconds:
+            async with self._turn:  # not all at once, whatever number of connections they come by
+                await asyncio.sleep(SLOW)
+                return self.enter(password)
+        return self.enter(password)
 
     def enter(self, password: str) -> str | None:
         """Return a new cookie for the right password; None for another."""
         if not hmac.compare_digest(password.encode(), self._password):
+            self._wrong.append(self._clock())
             return None
         cookie = secrets.token_urlsafe(16)
         self._until[hashed(cookie)] = self._clock() + OWNER_SECONDS
@@ -161,12 +201,14 @@ class Guard:
     (the bytes of a POST).
     """
 
-    def __init__(self, app: ASGIApp, *, sessions: Sessions, owner: OwnerDoor, public_url: str | None):
+    def __init__(self, app: ASGIApp, *, sessions: Sessions, owner: OwnerDoor, cookies: Cookies, public_url: str | None):
         """Stand before ``app``."""
         self._app = app
+        self._cookies = cookies
         self._sessions = sessions
         self._owner = owner
         self._public = origin_of(public_url) if public_url else None
+        self._names = frozenset[str]() if self._public is None else _names_of(self._public)
         self._buckets = Buckets()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -198,10 +240,10 @@ class Guard:
         try:
             if self._sessions.stale:
                 await run_in_threadpool(self._sessions.refresh)
-            rater = self._sessions.rater(cookies.get(RATER))
+            rater = self._sessions.rater(cookies.get(self._cookies.rater))
         except StoreError as error:
             return await refuse(*trouble(error), Retry_After="5")
-        owner = self._owner.knows(cookies.get(OWNER))
+        owner = self._owner.knows(cookies.get(self._cookies.owner))
         seconds = self._wait(scope, cookies, rater, owner)
         if seconds:
             return await refuse(429, "Too many requests; wait a moment.", Retry_After=str(int(seconds) + 1))
@@ -228,7 +270,7 @@ class Guard:
             await refuse(500, "Something went wrong on the server. Its owner finds more in its output.")
 
     def _ours(self, host: str) -> bool:
-        return self._is_local(host) or (self._public is not None and host.lower() == urlsplit(self._public).netloc)
+        return self._is_local(host) or host.lower() in self._names
 
     @staticmethod
     def _is_local(host: str) -> bool:
@@ -241,10 +283,18 @@ class Guard:
     def _wait(self, scope: Scope, cookies: dict[str, str], rater: str | None, owner: bool) -> float:
         address = str((scope.get("client") or ("",))[0])
         if (scope["method"], scope["path"]) == ("POST", "/owner/login"):
-            return self._buckets.wait(f"login {address}", *LOGINS)
+            return 0.0  # see ``OwnerDoor``
         if rater is None and not owner:
             return self._buckets.wait(f"address {address}", *PER_ADDRESS)
-        return self._buckets.wait(f"session {hashed(cookies[RATER if rater else OWNER])}", *PER_SESSION)
+        return self._buckets.wait(
+            f"session {hashed(cookies[self._cookies.rater if rater else self._cookies.owner])}", *PER_SESSION
+        )
+
+
+def _names_of(origin: str) -> frozenset[str]:
+    """Return what a browser or a server before this one may write as the host of an origin."""
+    parts = urlsplit(origin)
+    return frozenset({parts.netloc, f"{parts.netloc}:{PORTS[parts.scheme]}"} if parts.port is None else {parts.netloc})
 
 
 async def _body(headers: Headers, receive: Receive) -> bytes | None:
@@ -270,22 +320,6 @@ def _cookies(header: str) -> dict[str, str]:
         except CookieError:
             continue
     return found
-
-
-def origin_of(url: str) -> str:
-    """Return the origin of a page's address.
-
-    Examples:
-        >>> origin_of("https://Rate.example.org/")
-        'https://rate.example.org'
-
-    Raises:
-        InvalidValueError: it is no address of a whole site.
-    """
-    parts = urlsplit(url)
-    if parts.scheme not in ("http", "https") or not parts.netloc or parts.path.strip("/") or parts.query:
-        raise _checks.InvalidValueError("public_url", url, "an address such as https://rate.example.org")
-    return f"{parts.scheme}://{parts.netloc.lower()}"
 
 
 def trouble(error: StoreError) -> tuple[int, str]:

@@ -36,7 +36,9 @@ let pollTimer;
 const gone = new Set(); // leases that were answered here, and items whose file is missing
 const history = recall();
 
-const outbox = new Outbox(`uard-outbox:${who}`, { told, refused, changed: showStatus });
+const broken = new Map(); // leases of what this browser cannot show, and which item it is
+const page = { rater: config.rater, question: config.question };
+const outbox = new Outbox(`uard-outbox:${who}`, page, { told, refused, stopped, changed: showStatus });
 
 function recall() {
   try {
@@ -62,11 +64,10 @@ async function fill() {
   filling = true;
   let again = current || tasks.length ? null : POLL;
   try {
-    const response = await post("/api/next", { count: Math.min(AHEAD + 1 + unsent().length, MOST) });
-    if (response.status === 401) {
-      const { error } = await response.json();
-      outbox.locked = true;
-      say("Your link is needed", `${error}${unsent().length ? " Your answers are kept in this browser." : ""}`);
+    const response = await post("/api/next", { ...page, count: Math.min(AHEAD + 1 + unsent().length, MOST) });
+    if ([401, 409].includes(response.status)) {
+      const { error, why } = await response.json();
+      outbox.stop(error, why);
       return;
     }
     if (!response.ok) throw new Error(String(response.status));
@@ -95,6 +96,7 @@ function take(reply) {
     return;
   }
   const known = new Set([current, ...tasks].filter(Boolean).map((task) => task.lease));
+  for (const { lease } of reply.tasks) if (broken.has(lease)) report(lease); // to a server that was started again
   for (const task of reply.tasks) if (!known.has(task.lease) && !gone.has(task.lease)) tasks.push(ready(task));
   tasks.sort((a, b) => (b.kind === "practice") - (a.kind === "practice"));
   if (!current && !waiting && !undoing) {
@@ -109,16 +111,30 @@ function ready(task) {
   const attempt = async () => {
     for (;;) {
       try {
-        return await Promise.all(task.contents.map(prepare));
+        return await Promise.all(task.contents.map((content) => prepare(content).catch((error) => {
+          error.item = content?.id;
+          throw error;
+        })));
       } catch (error) {
-        if (!(error instanceof TypeError) && !/^(429|5\d\d)$/.test(error.message)) throw error;
+        if (!(error instanceof TypeError) && !/^(401|429|5\d\d)$/.test(error.message)) throw error;
         await new Promise((resolve) => setTimeout(resolve, 1000));
       }
     }
   };
   task.ready = attempt();
-  task.ready.then((parts) => { task.parts = parts; }, () => { task.broken = true; });
+  task.ready.then((parts) => { task.parts = parts; }, (error) => {
+    task.broken = true;
+    broken.set(task.lease, error.item);
+    report(task.lease);
+  });
   return task;
+}
+
+// Tells the server what this browser cannot show, so that something else comes in its place.
+function report(lease) {
+  const body = { rater: config.rater, lease };
+  if (broken.get(lease)) body.item = broken.get(lease);
+  post("/api/broken", body).then(fill, () => { /* it is told again when it comes again */ });
 }
 
 function release(task) {
@@ -128,6 +144,7 @@ function release(task) {
 
 // Shows the next item; `since` is when the last one was answered.
 async function next(since) {
+  if (outbox.locked) return;
   asked = since ?? asked;
   const mine = ++turn;
   current = tasks.shift() ?? null;
@@ -142,12 +159,12 @@ async function next(since) {
     try {
       await task.ready;
     } catch {
-      gone.add(task.lease); // the server has noticed it, too, and hands it out no more
+      gone.add(task.lease); // the server is told of it, and hands it out no more
     }
     clearTimeout(late);
     if (mine !== turn) return;
     if (task.broken) {
-      hint("An item was left out: its file is missing on the server.");
+      hint("An item was left out: this browser cannot show it.");
       next();
       return;
     }
@@ -237,23 +254,28 @@ function told(record, reply) {
   fill();
 }
 
-function refused(record, sentence, status) {
-  if (status === 401) {
-    say("Your link is needed", `${sentence} Your answers are kept in this browser.`);
-    return;
-  }
+function refused(record, sentence) {
   if (record.path === "/api/undo") {
     if (undoing === record.body.id) {
       undoing = null;
       next();
     }
-    if (status === 404 || status === 409) return; // it does not count already
+    return;
   }
-  note(`An answer was not accepted. ${sentence}`, true);
+  note(`An answer was not accepted, and is kept aside. ${sentence}`, true);
   if (waiting === record.body.id) {
     waiting = null;
     next();
   }
+}
+
+// The page can do nothing more as it is; what was said stays in this browser.
+function stopped(sentence, why) {
+  const number = unsent().length;
+  const kept = number ? ` ${number === 1 ? "One answer is" : `${number} answers are`} kept in this browser.` : "";
+  const titles = { rater: "This browser is another rater's now", question: "The question was changed" };
+  const more = { question: " Load this page again to go on." }[why] ?? "";
+  say(titles[why] ?? "Your link is needed", `${sentence}${kept}${more}`);
 }
 
 function undo() {
@@ -327,6 +349,30 @@ function showStatus() {
   const text = parts.join(" ");
   if (place.status.textContent !== text) place.status.textContent = text;
   place.status.classList.toggle("warning", Boolean(late));
+  const aside = outbox.aside().length;
+  find("show-aside").hidden = !aside;
+  find("show-aside").textContent = `${aside} not accepted`;
+}
+
+// What the server did not take: the rater may send it again, say when the question is what it was, or drop it.
+function showAside() {
+  const said = ({ values, choice }) => choice ?? Object.entries(values ?? {}).map(([name, value]) => `${name ? `${name} ` : ""}${shortened(value)}`).join(", ");
+  const button = (text, does) => {
+    const made = document.createElement("button");
+    made.type = "button";
+    made.textContent = text;
+    made.addEventListener("click", () => { does(); showAside(); });
+    return made;
+  };
+  find("aside-list").replaceChildren(...outbox.aside().map(({ body, at, sentence }) => {
+    const item = document.createElement("li");
+    const text = document.createElement("p");
+    text.textContent = `${at ? `${new Date(at).toLocaleString()}: ` : ""}${said(body)}. ${sentence}`;
+    item.append(text, button("Send again", () => outbox.retry(body.id)), " ", button("Drop", () => outbox.drop(body.id)));
+    return item;
+  }));
+  if (find("aside-list").children.length) open("aside");
+  else find("aside").close();
 }
 
 function showProgress(open) {
@@ -456,6 +502,7 @@ find("submit").addEventListener("click", (event) => { event.preventDefault(); on
 find("skip").addEventListener("click", once((event) => submit(event, true)));
 find("undo").addEventListener("click", once(undo));
 find("undo-last").addEventListener("click", once(undo));
+find("show-aside").addEventListener("click", showAside);
 find("show-help").addEventListener("click", () => open("help"));
 find("show-instructions").addEventListener("click", showInstructions);
 rows.forEach((row, k) => {
@@ -469,6 +516,7 @@ if (config.kind === "pairs") {
 }
 
 say("One moment", "The first item is on its way.");
+showStatus();
 firstTime();
 outbox.run();
 fill();
