@@ -242,7 +242,9 @@ def test_pairs_that_cannot_be_drawn_make_no_project(run, tmp_path):
 
 
 def test_a_link_is_to_a_page(run):
-    run("record", "TrapGrid6", "grid", "--segments", 2, "--length", 1)
+    assert "already" not in run("record", "TrapGrid6", "grid", "--segments", 2, "--length", 1)[2]
+    again = run("record", "TrapGrid6", "grid", "--segments", 2, "--length", 1)[2]
+    assert "all of them were in the project already: another --seed makes others" in again
     code, _, err = run("invite", "grid", "ann", "--url", "javascript:alert(1)")
     assert code == 2
     assert "url = 'javascript:alert(1)': must be an address such as" in err

@@ -74,7 +74,7 @@ class Record:
             closing(acting.environment(self.environment, read(self.set))) as env,
             projects.begun(self.project, self.asked) as project,
         ):
-            act = acting.policy(self.policy, env)
+            act, before = acting.policy(self.policy, env), projects.names(project)
             with progress.bar(console, f"recording {self.environment}") as move:
                 clips = record(
                     env,
@@ -93,6 +93,7 @@ class Record:
         terminal.say(console, f"{counted(len(clips), 'clip')} ({act.name}), {counted(frames, 'frame')}{observed}")
         if len(clips) < self.segments:
             terminal.say(console, f"fewer than {self.segments}: after these, no new ones came")
+        projects.tell_known(console, before, clips, ": another --seed makes others")
         projects.finish(console, project, clips, self.asked, self.pairs, self.seed)
 
 
@@ -117,9 +118,11 @@ class Texts:
 
         _check_pairs(self.pairs, self.seed)
         with projects.begun(self.project, self.asked) as project:
+            before = projects.names(project)
             items = texts(self.file, project)
         prompts = len({item.content["prompt"] for item in items})
         terminal.say(console, f"{counted(len(items), 'completion')} of {counted(prompts, 'prompt')}")
+        projects.tell_known(console, before, items, "")
         asked = self.asked
         if (
             asked.kind is None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -84,6 +84,22 @@ def begun(folder: str, asked: Asked) -> Iterator[Project]:
             (path / MEDIA).rmdir()
             path.rmdir()
         raise
+
+
+def names(project: Project) -> set[str]:
+    """Return the names of the items that a project has now."""
+    if not (project.folder / "answers.sqlite").exists():  # nothing is made yet that would be left if all failed
+        return set()
+    with closing(project.store()) as store:
+        return {item.id for item in store.items()[0]}
+
+
+def tell_known(console: Console, before: set[str], items: Sequence[Item], remedy: str) -> None:
+    """Say how many items the project had already, and what brings others."""
+    there = sum(item.id in before for item in items)
+    if there:
+        few = "all of them were" if there == len(items) else f"{there} of them {'was' if there == 1 else 'were'}"
+        terminal.say(console, f"{few} in the project already{remedy}")
 
 
 def is_new(project: Project) -> bool:
