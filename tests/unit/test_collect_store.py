@@ -1,6 +1,7 @@
 """The store of items, raters, requests and answers: nothing acknowledged is lost, nothing is there twice."""
 
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -425,3 +426,28 @@ def test_nothing_is_read_before_a_file_is_there(tmp_path):
     with SQLiteStore(tmp_path / "answers.sqlite") as store:
         assert store.items() == ((), 0)
         assert store.answers()[1] == 0
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_an_archive_is_read_and_never_changed(tmp_path, monkeypatch, killed):
+    home, archive = tmp_path / "home #1?", tmp_path / "archive #1?"  # which mean something in an address
+    home.mkdir()
+    with SQLiteStore(home / "answers.sqlite") as store:
+        store.add_items(ITEMS)
+        store.invite("ann")
+        store.put([said("a1")])
+        if killed:  # its last answers are in the log beside the database
+            shutil.copytree(home, archive)
+    if not killed:
+        shutil.copytree(home, archive)
+    before = {path.name: path.read_bytes() for path in archive.iterdir() if not path.name.endswith("-shm")}
+    assert ("answers.sqlite-wal" in before) == killed
+    monkeypatch.setattr("uard.collect.schema.os.access", lambda path, mode: mode != os.W_OK)
+    with SQLiteStore(archive / "answers.sqlite") as store:
+        assert store.read_only
+        assert [a.id for a in store.answers()[0]] == ["a1"]
+        assert len(store.items()[0]) == len(ITEMS)
+        for change in (lambda: store.invite("bob"), lambda: store.put([said("a2", Y)]), lambda: store.lease("ann")):
+            with pytest.raises(StoreError, match=r"cannot be changed: .* write-protected\. Copy"):
+                change()
+    assert {path.name: path.read_bytes() for path in archive.iterdir() if not path.name.endswith("-shm")} == before

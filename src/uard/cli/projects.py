@@ -67,6 +67,7 @@ def begun(folder: str, asked: Asked) -> Iterator[Project]:
     if (path / SETTINGS).exists():
         for name, value in asked.given().items():
             raise _checks.InvalidValueError(f"--{name}", value, f"left out: it stands in {path / SETTINGS}")
+        files.prepare_folder(str(path / MEDIA), "project")
         yield Project.open(path)
         return
     low, high = asked.low, asked.high

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 import sqlite3
 from pathlib import Path
@@ -10,6 +11,7 @@ from uard.collect.store import StoreError
 from uard.ratings.table import FIELDS
 
 VERSION = 1
+PATIENCE = 10.0  # seconds to wait for another process that writes
 APPLICATION = 0x75617264  # "uard", so that `file` and we know whose database it is
 
 SCHEMA = f"""
@@ -71,6 +73,31 @@ ORDER BY priority DESC, seq
 
 What the other one has answered by another way is not asked of anybody: its place is taken.
 """
+
+
+def is_read_only(path: Path) -> bool:
+    """Whether a file is there and cannot be changed; SQLite needs to write beside it, too."""
+    return path.is_file() and not (os.access(path, os.W_OK) and os.access(path.parent, os.W_OK))
+
+
+def connect(path: Path, read_only: bool) -> sqlite3.Connection:
+    """Open a file. What is read-only and was closed in order is taken as it is, for SQLite would write beside it."""
+    where = str(path)
+    if read_only:
+        log = path.with_name(f"{path.name}-wal")  # what a server that was killed has not moved to its place yet
+        pending = log.is_file() and log.stat().st_size > 0
+        where = f"{path.resolve().as_uri()}?{'mode=ro' if pending else 'mode=ro&immutable=1'}"
+    found = sqlite3.connect(where, timeout=PATIENCE, isolation_level=None, check_same_thread=False, uri=read_only)
+    found.row_factory = sqlite3.Row
+    return found
+
+
+def settle(db: sqlite3.Connection, read_only: bool) -> None:
+    """Set how a connection writes, which looks at the file for the first time."""
+    if not read_only:
+        db.execute("PRAGMA journal_mode = WAL")
+        db.execute("PRAGMA synchronous = FULL")  # what is acknowledged survives the loss of power, too
+        db.execute("PRAGMA foreign_keys = ON")
 
 
 def prepare(db: sqlite3.Connection, path: Path) -> str:

@@ -32,7 +32,7 @@ from uard.collect.store import (
 )
 from uard.ratings.table import FIELDS, LONGEST, Answer, Answers
 
-PATIENCE = 10.0  # seconds to wait for another process that writes
+_COPY = ": it, or its folder, is write-protected. Copy the project's whole folder to where it can be written"
 
 
 @final
@@ -52,6 +52,7 @@ class SQLiteStore(AnswerStore):
 
     Attributes:
         path: The file.
+        read_only: Whether nothing can be written to it, as in an archive; all is read all the same.
     """
 
     def __init__(self, path: str | Path, *, clock: Callable[[], float] = time.time):
@@ -65,13 +66,14 @@ class SQLiteStore(AnswerStore):
             StoreError: it cannot be opened, is no such store, or is of another version.
         """
         self.path = Path(path)
+        self.read_only = schema.is_read_only(self.path)
         self._clock = clock
         self._local = threading.local()
         self._opened: list[sqlite3.Connection] = []
         self._lock = threading.Lock()
-        with suppress(OSError):  # for nobody else's eyes; SQLite says what is wrong if it cannot be made
+        with suppress(OSError):  # new ones: for nobody else's eyes; SQLite says what is wrong if it cannot be made
             os.close(os.open(self.path, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600))
-        with self._changing() as db:
+        with self._reading() if self.read_only else self._changing() as db:
             self._identity = schema.prepare(db, self.path)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -102,26 +104,28 @@ class SQLiteStore(AnswerStore):
     def _connection(self) -> sqlite3.Connection:
         found: sqlite3.Connection | None = getattr(self._local, "connection", None)
         if found is None:
-            found = sqlite3.connect(self.path, timeout=PATIENCE, isolation_level=None, check_same_thread=False)
-            found.row_factory = sqlite3.Row
+            found = schema.connect(self.path, self.read_only)
             with self._lock:
                 self._opened.append(found)
-            found.execute("PRAGMA journal_mode = WAL")
-            found.execute("PRAGMA synchronous = FULL")  # what is acknowledged survives the loss of power, too
-            found.execute("PRAGMA foreign_keys = ON")
+            schema.settle(found, self.read_only)
             self._local.connection = found
         return found
+
+    def _remedy(self, error: sqlite3.Error) -> str:
+        return _COPY if self.read_only and isinstance(error, sqlite3.OperationalError) else ""
 
     @contextmanager
     def _reading(self) -> Generator[sqlite3.Connection]:
         try:
             yield self._connection()
         except sqlite3.Error as error:
-            raise StoreError(f"{self.path}: {error}") from error
+            raise StoreError(f"{self.path}: {error}{self._remedy(error)}") from error
 
     @contextmanager
     def _changing(self) -> Generator[sqlite3.Connection]:
         """Change all or nothing; other writers wait."""
+        if self.read_only:
+            raise StoreError(f"{self.path} cannot be changed{_COPY}")
         with self._reading() as db:
             db.execute("BEGIN IMMEDIATE")
             try:
