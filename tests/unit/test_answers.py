@@ -142,6 +142,53 @@ def test_half_an_emoji_in_an_old_store_does_not_stop_an_export():
         assert export.write(said, items, form)
 
 
+def test_a_record_with_half_an_emoji_is_read_back_as_it_was():
+    said = Answers((rated("c1", "x", "ann", 0.5, comment="\ud83d and \n\x00"),))
+    assert export.read_record(export.write(said, {}, "record")) == said
+
+
+def test_strata_of_an_old_store_are_cells_that_can_be_read(tmp_path):
+    items = {"x": {"stratum": "\x00\n" + "m" * 1_000_000}, "y": {"stratum": "\ud800"}}
+    said = Answers((rated("c1", "x", "ann", 0.5), rated("c2", "y", "ann", 0.5)))
+    for form in ("csv", "jsonl", "parquet"):
+        path = tmp_path / f"said.{form}"
+        path.write_bytes(export.write(said, items, form))
+        assert readers.read(path).ratings.shape == (2, 1)
+    assert all(len(row["stratum"]) <= 200 for row in export.rows_of(said, items))
+
+
+@pytest.mark.parametrize("name", ["reward", "item", "rating", "id", "kind"])
+def test_an_attribute_of_an_old_store_destroys_no_column(name):
+    said = Answers((rated("a1", "x", "ann", 0.25), rated("a1.1", "x", "ann", 0.5, attribute=name)))
+    (row,), (plain,) = export.rows_of(said, ITEMS), export.rows_of(Answers(said.rows[:1]), ITEMS)
+    assert row == plain | {f"{name} (rated)": 0.5}
+
+
+def test_no_head_of_a_column_is_a_formula():
+    said = Answers((rated("a1", "x", "ann", 0.25), rated("a1.1", "x", "ann", 0.5, attribute='=HYPERLINK("x")')))
+    assert next(csv.reader(io.StringIO(export.write(said, ITEMS, "csv").decode())))[-5] == '\'=HYPERLINK("x")'
+
+
+def test_of_what_was_given_in_one_go_and_corrected_in_part_there_is_one_row():
+    said = Answers((
+        rated("a1", "x", "ann", 0.25), rated("a1.1", "x", "ann", 0.5, attribute="safe"),
+        rated("b1", "x", "ann", -1.0, supersedes="a1"),
+        rated("c1", "y", "ann", 0.25), rated("c1.1", "y", "ann", 0.5, attribute="safe"),
+        rated("d1", "y", "ann", 0.75, supersedes="c1"),
+        rated("d1.1", "y", "ann", 1.0, supersedes="c1.1", attribute="safe"),
+    ))  # fmt: skip
+    rows = export.rows_of(said, ITEMS)
+    assert [(r["id"], r["rating"], r["safe"]) for r in rows] == [("b1", -1.0, 0.5), ("d1", 0.75, 1.0)]
+    for task in json.loads(export.write(said, ITEMS, "label-studio")):
+        (mark,) = task["annotations"]
+        assert len(mark["result"]) == 2
+
+
+def test_the_latest_time_can_be_written():
+    said = Answers((rated("a1", "x", "ann", 0.25), Answer("a2", "x", "ann", 1.0, given_at=253_402_300_799.0)))
+    assert export.rows_of(said, ITEMS)[1]["given_at"] == "9999-12-31T23:59:59+00:00"
+
+
 def test_a_part_of_what_was_given_in_one_go_keeps_its_name():
     main = Answer("b1", "x", "ann", 0.5)
     part = Answer("b1.1", "x", "ann", 1.0, attribute="safe")

@@ -11,7 +11,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from uard import _checks
-from uard.ratings.table import FIELDS, Answer, Answers, answer_of
+from uard._support.text import printable
+from uard.ratings.table import FIELDS, LATEST, LONGEST, Answer, Answers, answer_of
 
 Contents = Mapping[str, Mapping[str, Any]]
 """Name of an item -> its content (``uard.collect.items``)."""
@@ -86,20 +87,36 @@ def rows_of(answers: Answers, items: Contents) -> list[Row]:
     """
     rows: dict[tuple[str, str, str], Row] = {}  # attributes are given in one go, at one time
     attributes: list[str] = []
+    given_with = _submissions(answers)
     for a in answers.standing():
         if a.kind == "practice":
             continue
-        content = items.get(a.item, {})
-        place = a.item, a.rater, a.id.partition(".")[0] if a.attribute else a.id
-        row = rows.setdefault(place, _row(a, content) | {"id": place[2]})
+        place = a.item, a.rater, given_with[a.id]
+        row = rows.setdefault(place, _row(a, items.get(a.item, {})) | {"id": given_with[a.id]})
         if a.attribute:
-            row[a.attribute] = a.value
-            attributes.append(a.attribute)
+            column = f"{a.attribute} (rated)" if a.attribute in COLUMNS else a.attribute  # in a store of before
+            row[column] = a.value
+            attributes.append(column)
         else:
-            row["rating"], row["choice"], row["comment"] = a.value, a.choice, a.comment or None
+            row |= {"rating": a.value, "choice": a.choice, "comment": a.comment or None, "id": a.id}
     names = [*_COLUMNS, *(n for n in dict.fromkeys(attributes)), *_AFTER]
     used = [n for n in names if any(row.get(n) is not None for row in rows.values())]
     return [{n: row.get(n) for n in used} for row in rows.values()]
+
+
+def _submissions(answers: Answers) -> dict[str, str]:
+    """Return for each answer the name of what was first given in one go with it.
+
+    An answer that takes another's place belongs to what that was given with, even if only one of several parts was
+    corrected.
+    """
+    found: dict[str, str] = {}
+    for a in answers:
+        begun = found.get(a.supersedes, a.supersedes) if a.supersedes is not None else None
+        if begun is None:
+            begun = (a.id.rpartition(".")[0] or a.id) if a.attribute else a.id
+        found[a.id] = begun
+    return found
 
 
 _COLUMNS = ("item", "rater", "rating", "left", "right", "choice", "reward", "stratum")
@@ -115,7 +132,7 @@ def _row(answer: Answer, content: Mapping[str, Any]) -> Row:
         "left": answer.left,
         "right": answer.right,
         "reward": content.get("reward"),
-        "stratum": content.get("stratum") or None,
+        "stratum": printable(str(content.get("stratum") or ""))[:LONGEST] or None,  # which was any text once
         "kind": answer.kind,
         "shown_at": _time(answer.shown_at),
         "given_at": _time(answer.given_at),
@@ -123,16 +140,17 @@ def _row(answer: Answer, content: Mapping[str, Any]) -> Row:
 
 
 def _time(seconds: float) -> str:
-    return datetime.fromtimestamp(seconds, UTC).isoformat()
+    return datetime.fromtimestamp(min(seconds, LATEST), UTC).isoformat()
 
 
 def _csv(answers: Answers, items: Contents) -> bytes:
     rows = rows_of(answers, items)
     out = io.StringIO(newline="")
-    writer = csv.DictWriter(out, list(rows[0]) if rows else list(_COLUMNS), lineterminator="\n")
-    writer.writeheader()
+    names = list(rows[0]) if rows else list(_COLUMNS)
+    writer = csv.DictWriter(out, names, lineterminator="\n")
+    writer.writerow({name: _harmless(name) for name in names})
     writer.writerows([{name: _harmless(value) for name, value in row.items()} for row in rows])
-    return out.getvalue().encode(errors="replace")
+    return out.getvalue().encode(errors=_HALF)
 
 
 def _harmless(value: Any) -> Any:
@@ -148,12 +166,12 @@ def _lines(rows: Sequence[Row]) -> bytes:
     return "".join(json.dumps(row, ensure_ascii=False, allow_nan=False) + "\n" for row in rows).encode(errors=_HALF)
 
 
-_HALF = "replace"  # half of a surrogate pair, which has no UTF-8
+_HALF = "backslashreplace"  # half of a surrogate pair has no UTF-8; in JSON its escape is read as what it was
 
 
-def _whole(rows: Sequence[Row]) -> str:
-    """Return rows as JSON that holds no half of a surrogate pair."""
-    return json.dumps(rows, ensure_ascii=False, allow_nan=False).encode(errors=_HALF).decode()
+def _encodable(value: Any) -> Any:
+    """Return a cell that has UTF-8."""
+    return value.encode(errors=_HALF).decode() if isinstance(value, str) else value
 
 
 def _parquet(answers: Answers, items: Contents) -> bytes:
@@ -164,7 +182,7 @@ def _parquet(answers: Answers, items: Contents) -> bytes:
         allowed = "csv or jsonl, or first: pip install 'uard[doctor]' (pyarrow writes Parquet)"
         raise _checks.InvalidValueError("form", "parquet", allowed) from None
     out = io.BytesIO()
-    rows: list[Row] = json.loads(_whole(rows_of(answers, items)))
+    rows = [{_encodable(name): _encodable(value) for name, value in row.items()} for row in rows_of(answers, items)]
     parquet.write_table(pa.Table.from_pylist(rows), out)
     return out.getvalue()
 
@@ -190,13 +208,14 @@ def _trl(answers: Answers, items: Contents) -> bytes:
 
 def _label_studio(answers: Answers, items: Contents) -> bytes:
     tasks: dict[str, Row] = {}
+    given_with = _submissions(answers)
     for a in answers.standing():
         if a.kind == "practice":
             continue
         data = {"item": a.item} | {k: v for k, v in items.get(a.item, {}).items() if v is not None}
         task = tasks.setdefault(a.item, {"id": len(tasks) + 1, "data": data, "annotations": []})
         marks = task["annotations"]
-        group = a.id.partition(".")[0] if a.attribute else a.id
+        group = given_with[a.id]
         mark = next((m for m in marks if m["unique_id"] == group), Row())
         if not mark:
             mark |= {"id": a.id, "unique_id": group, "completed_by": a.rater, "was_cancelled": a.choice == "skip"}
