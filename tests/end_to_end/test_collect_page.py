@@ -20,6 +20,7 @@ SERVE = "import sys, json; from uard.collect.serving import serve; serve(sys.arg
 PASSWORD = "open sesame"
 MARKUP = "<b>bold</b>\n\n  <script>document.title = 'hacked'</script> & <img src=x onerror=alert(1)>"
 EXPECTED = ("ERR_INTERNET_DISCONNECTED", "ERR_CONNECTION_REFUSED", "ERR_CONNECTION_RESET", "ERR_EMPTY_RESPONSE")
+CONFLICT = "409 (Conflict)"  # what a browser notes of an answer that is not accepted
 FRAMES, COLUMNS, SIZE = 12, 4, 96
 
 
@@ -127,7 +128,7 @@ def visit(browser):
     opened, wrong = [], []
 
     def note(text):
-        if not any(word in text for word in EXPECTED):
+        if not any(word in text for word in (*EXPECTED, CONFLICT)):
             wrong.append(text)
 
     def visit(served, rater, begin=True, prepare=None, **settings):
@@ -367,6 +368,96 @@ def test_the_server_is_killed_and_started_again(serving, visit):
     assert len({r.item for r in rows}) == 3
     answer(page, "5")
     assert served.wait_for("killed", 4)[-1].item not in {r.item for r in rows}
+
+
+@pytest.fixture
+def own(tmp_path):
+    """Serve a project of one's own."""
+    made = []
+
+    def get(items, **settings):
+        (tmp_path / "own" / "media").mkdir(parents=True)
+        made.append(Served(tmp_path / "own", Question(**{"overlap": 50, "repeats": 0.0} | settings), items))
+        return made[-1]
+
+    yield get
+    for served in made:
+        served.kill()
+        served.store.close()
+
+
+def test_two_raters_in_one_browser(own, visit):
+    served = own(TEXTS)
+    visitor = visit(served, "ann")
+    page = visitor.page
+    answer(page, "3")
+    served.wait_for("ann", 1)
+    other = visitor.context.new_page()
+    other.goto(f"{served.url}/enter/{served.store.invite('bob')}")
+    other.get_by_role("button", name="Begin").click()
+    other.get_by_role("heading", name="Instructions").wait_for()
+    page.wait_for_timeout(350)
+    page.keyboard.press("4")
+    page.keyboard.press("Enter")
+    page.get_by_role("heading", name="This browser is another rater's now").wait_for()
+    assert "One answer is kept in this browser" in page.locator("#message-text").inner_text()
+    assert len(served.store.answers()[0]) == 1
+    other.goto(f"{served.url}/enter/{served.store.invite('ann')}")
+    other.get_by_role("button", name="Begin").click()
+    assert [r.value for r in served.wait_for("ann", 2)] == [-0.5, -0.25]
+    assert served.rows("bob") == []
+
+
+def test_answers_under_a_question_that_was_changed_are_kept_aside(own, visit):
+    served = own(TEXTS)
+    page = visit(served, "ann").page
+    answer(page, "3")
+    served.wait_for("ann", 1)
+    page.wait_for_timeout(500)
+    served.kill()
+    for digit in "45":
+        answer(page, digit, pause=350)
+    file = served.project.folder / "project.toml"
+    old = file.read_text()
+    file.write_text(old.replace("low = -1.0", "low = -50.0").replace("high = 1.0", "high = 50.0"))
+    served.start()
+    page.get_by_role("heading", name="The question was changed").wait_for()
+    assert "2 answers are kept in this browser" in page.locator("#message-text").inner_text()
+    page.reload()
+    page.get_by_role("button", name="2 not accepted").click()
+    assert page.locator("#aside-list li").count() == 2
+    assert "-0.25. The owner has changed the question" in page.locator("#aside-list li").first.inner_text()
+    page.get_by_role("button", name="Drop").first.click()
+    page.get_by_role("button", name="Close").click()
+    page.locator("#work:visible").wait_for()
+    answer(page, "9", pause=350)
+    rows = served.wait_for("ann", 2)
+    assert [(r.value, r.scale) for r in rows] == [(-0.5, "slider -1..1"), (50.0, "slider -50..50")]
+    served.kill()
+    file.write_text(old)
+    served.start()
+    page.reload()
+    page.locator("#work:visible").wait_for()
+    page.get_by_role("button", name="1 not accepted").click()
+    page.get_by_role("button", name="Send again").click()
+    assert [(r.value, r.scale) for r in served.wait_for("ann", 3)][-1] == (0.0, "slider -1..1")
+    page.get_by_role("button", name="not accepted").wait_for(state="hidden")
+
+
+def test_sheets_that_a_browser_cannot_decode_are_left_out(own, visit):
+    served = own([])
+    names = [served.project.keep(f"RIFFnothing {k}".encode() if k % 2 else sheet(k), "webp") for k in range(24)]
+    items = [clip_item(n, FRAMES, COLUMNS, (SIZE, SIZE)) for n in names]
+    served.store.add_items(items)
+    page = visit(served, "ann").page
+    for k in range(11):
+        answer(page, str(1 + k % 9), pause=350)
+    page.wait_for_timeout(350)
+    page.keyboard.press("5")
+    page.keyboard.press("Enter")
+    assert {r.item for r in served.wait_for("ann", 12)} == {i.id for i in items[::2]}
+    page.get_by_role("heading", name="Nothing left for now").wait_for()
+    page.wait_for_function("() => document.getElementById('count').textContent === '12 answered'")
 
 
 def test_a_browser_that_stores_nothing(serving, visit):

@@ -262,7 +262,7 @@ function refused(record, sentence) {
     }
     return;
   }
-  note(`An answer was not accepted, and is kept aside. ${sentence}`, true);
+  note(`An answer was not accepted, and is kept aside. ${sentence}`);
   if (waiting === record.body.id) {
     waiting = null;
     next();
@@ -326,10 +326,10 @@ function hint(text) {
 
 let noteText = "";
 let noteTimer;
-function note(text, lasting = false) {
+function note(text) {
   noteText = text;
   clearTimeout(noteTimer);
-  if (!lasting) noteTimer = setTimeout(() => { noteText = ""; showStatus(); }, 8000);
+  noteTimer = setTimeout(() => { noteText = ""; showStatus(); }, 8000);
   showStatus();
 }
 
@@ -503,6 +503,7 @@ find("skip").addEventListener("click", once((event) => submit(event, true)));
 find("undo").addEventListener("click", once(undo));
 find("undo-last").addEventListener("click", once(undo));
 find("show-aside").addEventListener("click", showAside);
+find("aside").addEventListener("close", () => find("show-aside").blur()); // Enter is to submit, not to open it again
 find("show-help").addEventListener("click", () => open("help"));
 find("show-instructions").addEventListener("click", showInstructions);
 rows.forEach((row, k) => {
