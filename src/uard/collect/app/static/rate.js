@@ -1,5 +1,6 @@
 // The page on which people rate: what comes next is fetched and decoded ahead, answers are sent behind.
 
+import { Aside } from "./aside.js";
 import { Outbox, newId, post } from "./outbox.js";
 import { Stage, prepare, showAll } from "./player.js";
 import { RadioRow, SliderRow, shortened } from "./rows.js";
@@ -39,6 +40,7 @@ const history = recall();
 const broken = new Map(); // leases of what this browser cannot show, and which item it is
 const page = { rater: config.rater, question: config.question };
 const outbox = new Outbox(`uard-outbox:${who}`, page, { told, refused, stopped, changed: showStatus });
+const aside = new Aside(outbox, () => open("aside"));
 
 function recall() {
   try {
@@ -349,30 +351,7 @@ function showStatus() {
   const text = parts.join(" ");
   if (place.status.textContent !== text) place.status.textContent = text;
   place.status.classList.toggle("warning", Boolean(late));
-  const aside = outbox.aside().length;
-  find("show-aside").hidden = !aside;
-  find("show-aside").textContent = `${aside} not accepted`;
-}
-
-// What the server did not take: the rater may send it again, say when the question is what it was, or drop it.
-function showAside() {
-  const said = ({ values, choice }) => choice ?? Object.entries(values ?? {}).map(([name, value]) => `${name ? `${name} ` : ""}${shortened(value)}`).join(", ");
-  const button = (text, does) => {
-    const made = document.createElement("button");
-    made.type = "button";
-    made.textContent = text;
-    made.addEventListener("click", () => { does(); showAside(); });
-    return made;
-  };
-  find("aside-list").replaceChildren(...outbox.aside().map(({ body, at, sentence }) => {
-    const item = document.createElement("li");
-    const text = document.createElement("p");
-    text.textContent = `${at ? `${new Date(at).toLocaleString()}: ` : ""}${said(body)}. ${sentence}`;
-    item.append(text, button("Send again", () => outbox.retry(body.id)), " ", button("Drop", () => outbox.drop(body.id)));
-    return item;
-  }));
-  if (find("aside-list").children.length) open("aside");
-  else find("aside").close();
+  aside.tell();
 }
 
 function showProgress(open) {
@@ -502,8 +481,6 @@ find("submit").addEventListener("click", (event) => { event.preventDefault(); on
 find("skip").addEventListener("click", once((event) => submit(event, true)));
 find("undo").addEventListener("click", once(undo));
 find("undo-last").addEventListener("click", once(undo));
-find("show-aside").addEventListener("click", showAside);
-find("aside").addEventListener("close", () => find("show-aside").blur()); // Enter is to submit, not to open it again
 find("show-help").addEventListener("click", () => open("help"));
 find("show-instructions").addEventListener("click", showInstructions);
 rows.forEach((row, k) => {
