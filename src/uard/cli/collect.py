@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated
 from urllib.parse import urlsplit
 
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from uard import __version__, _checks
+from uard import _checks
 from uard._support.text import counted
 from uard.cli import progress, projects, terminal
+from uard.cli.exporting import Export
 from uard.cli.items import Items
-from uard.cli.projects import ASKED, AskedOptions
+from uard.cli.project_status import Status
+from uard.cli.projects import ASKED, Asked, AskedOptions
 from uard.cli.settings import Pairs
 from uard.cli.settings import settings as read
 from uard.cli.simulated import Simulate
@@ -23,12 +25,10 @@ from uard.cli.simulated import Simulate
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from uard.collect import Project
-    from uard.ratings.table import Answers
+    from uard.collect import Item, Project
 
 PORT = 8321
 PASSWORD = "UARD_OWNER_PASSWORD"  # an environment variable: an option would stand in everybody's list of processes
-_ENDINGS = {".csv": "csv", ".jsonl": "jsonl", ".parquet": "parquet", ".pq": "parquet", ".json": "label-studio"}
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,8 @@ class Record:
         from uard.collect.record import record
 
         _check_pairs(self.pairs, self.seed)
+        if self.asked.kind == "pairs":
+            _checks.whole("--segments", self.segments, low=2)  # one alone has none to stand beside
         with (
             closing(acting.environment(self.environment, read(self.set))) as env,
             projects.begun(self.project, self.asked) as project,
@@ -114,24 +116,36 @@ class Texts:
 
     def run(self, console: Console) -> None:
         """Read, make the project, and say what comes next."""
-        from uard.collect.texts import texts
+        from uard.collect.texts import read_texts
 
         _check_pairs(self.pairs, self.seed)
         with projects.begun(self.project, self.asked) as project:
-            before = projects.names(project)
-            items = texts(self.file, project)
+            before, items = projects.names(project), read_texts(self.file)
+            asked = self._asked(project, items)
+            with closing(project.store()) as store:
+                store.add_items(items)
         prompts = len({item.content["prompt"] for item in items})
         terminal.say(console, f"{counted(len(items), 'completion')} of {counted(prompts, 'prompt')}")
         projects.tell_known(console, before, items, "")
-        asked = self.asked
-        if (
-            asked.kind is None
-            and projects.is_new(project)
-            and projects.paid_by(items) is None
-            and len(items) == 2 * prompts
-        ):
-            asked = replace(asked, kind="pairs")  # such as chosen and rejected
         projects.finish(console, project, items, asked, self.pairs, self.seed)
+
+    def _asked(self, project: Project, items: Sequence[Item]) -> Asked:
+        """Return what is asked; in a new project that is pairs if there are two completions of each prompt.
+
+        Raises:
+            InvalidValueError: a new project is of pairs, and there are none.
+        """
+        from uard.collect.texts import comparable
+
+        if not projects.is_new(project):
+            return self.asked
+        if self.asked.kind == "pairs" and not comparable(items):
+            allowed = f"another one: {self.file} has no two completions of one prompt"
+            raise _checks.InvalidValueError("--kind", "pairs", allowed)
+        prompts = len({item.content["prompt"] for item in items})
+        if self.asked.kind is None and projects.paid_by(items) is None and len(items) == 2 * prompts:
+            return replace(self.asked, kind="pairs")  # such as chosen and rejected
+        return self.asked
 
 
 @dataclass(frozen=True)
@@ -158,8 +172,12 @@ class Serve:
 
     def run(self, console: Console) -> None:
         """Serve."""
+        from uard.collect import Project
         from uard.collect.serving import serve
 
+        project = Project.open(self.project)
+        with closing(project.store()) as store:
+            projects.tell_unknown(console, project, store.items()[0])
         names = [name.strip() for name in self.raters.split(",") if name.strip()]
         serve(
             self.project,
@@ -202,91 +220,6 @@ class Invite:
         terminal.say(console, f"give this link to {who}: it works once.{serve}")
 
 
-@dataclass(frozen=True)
-class Status:
-    """Say how far a project is: answers, by rater, and what is still to come."""
-
-    project: Positional[str]
-    """A project's folder."""
-    json: str | None = None
-    """Write one JSON object to this file; - for standard output."""
-
-    def run(self, console: Console) -> None:
-        """Read the store and print numbers."""
-        from uard.collect import Project
-
-        project = Project.open(self.project)
-        project.outside(self.json, "json")
-        found = _status(project)
-        if self.json is not None:
-            terminal.write_json({"version": __version__, "project": self.project} | found, self.json)
-        if self.json != "-":
-            rows = [_row(rater) for rater in found["raters"]]
-            if rows:
-                terminal.table(("rater", "answers", "skipped", "coverage", "link used"), rows, self.project)
-            out = terminal.output()
-            for line in _told(found):
-                terminal.say(out, line)
-        for name, why in found["damaged"].items():
-            terminal.warning(console, f"item {name} is not shown: {why}")
-        for name, table in found["unknown"].items():
-            terminal.warning(console, f"[[{table}]] names an item that is not in the project: {name}")
-        terminal.say(console, f"next: {_next(found, self.project)}")
-
-
-@dataclass(frozen=True)
-class Export:
-    """Write the answers into a file."""
-
-    project: Positional[str]
-    """A project's folder."""
-    file: Positional[str]
-    """Where to: .csv, .jsonl, .parquet, or .json for Label Studio."""
-    form: Literal["csv", "jsonl", "parquet", "trl", "label-studio", "record"] | None = None
-    """What it holds; by its ending if left out. trl: preference rows; record: every answer that was ever given, those
-    that were taken back included."""
-
-    def run(self, console: Console) -> None:
-        """Read the store and write the file."""
-        from uard._support import files
-        from uard.collect import Project
-        from uard.ratings import export
-
-        form = self.form or _ENDINGS.get(Path(self.file).suffix.lower())
-        if form is None:
-            allowed = f"a file that ends in {', '.join(_ENDINGS)}, or --form says what it holds"
-            raise _checks.InvalidValueError("file", self.file, allowed)
-        project = Project.open(self.project)
-        project.outside(self.file, "file")
-        with closing(project.store()) as store:
-            (answers, _), (items, _) = store.answers(), store.items()
-        data = export.write(answers, {item.id: item.content for item in items}, form)
-        try:
-            with files.replacing(self.file) as file:
-                file.write(data)
-        except OSError as error:
-            allowed = f"a file that can be written ({error.strerror or error})"
-            raise _checks.InvalidValueError("file", self.file, allowed) from None
-        terminal.say(console, f"{_held(answers, data, form)} in {self.file}{self._next(answers, project, form)}")
-
-    def _next(self, answers: Answers, project: Project, form: str) -> str:
-        """Return what can be done with the file."""
-        if form not in ("csv", "jsonl", "parquet") or not answers.standing():
-            return ""
-        return f". Next: {'uard preferences' if project.question.kind == 'pairs' else 'uard raters'} {self.file}"
-
-
-def _held(answers: Answers, data: bytes, form: str) -> str:
-    """Return how many rows a file holds, and why they may be fewer than the answers."""
-    if form == "record":
-        return f"{counted(len(answers), 'answer')}, practice and what was taken back included,"
-    rated = sum(not a.attribute and a.kind != "practice" for a in answers.standing())
-    if form == "trl":
-        preferences = counted(data.count(b"\n"), "preference")
-        return f"{preferences} of {counted(rated, 'answer')}, without ties and skips,"
-    return counted(rated, "answer")
-
-
 _Action = (
     Annotated[Record, subcommand("record")]
     | Annotated[Texts, subcommand("texts")]
@@ -315,53 +248,3 @@ def _check_pairs(pairs: int | None, seed: int) -> None:
     if pairs is not None:
         _checks.whole("--pairs", pairs, low=1, high=1_000_000)
     _checks.whole("--seed", seed, low=0, high=2**63 - 1)
-
-
-def _status(project: Project) -> dict[str, Any]:
-    from uard.collect.app.overview import overview
-
-    with closing(project.store()) as store:
-        (answers, _), (items, _), raters = store.answers(), store.items(), store.raters()
-        open_requests = len(store.open_requests()[0])
-    by_name = {item.id: item for item in items}
-    seen = overview(answers, by_name, project.question, [rater.name for rater in raters])
-    states = {rater.name: rater for rater in raters}
-    rows = [
-        {"name": r.name, "answers": r.answers, "skipped": r.skipped, "coverage": r.coverage}
-        | {"entered": r.name in states and states[r.name].entered}
-        | {"paused": r.name in states and states[r.name].paused}
-        for r in seen.raters
-    ]
-    return {
-        "items": seen.items,
-        "rated": seen.rated,
-        "complete": seen.complete,
-        "answers": seen.answers,
-        "wanted": seen.wanted,
-        "open_requests": open_requests,
-        "raters": rows,
-        "damaged": project.damaged(items),
-        "unknown": project.unknown(items),
-    }
-
-
-def _row(rater: dict[str, Any]) -> tuple[str, ...]:
-    name = f"{rater['name']} (paused)" if rater["paused"] else rater["name"]
-    used = "yes" if rater["entered"] else "no"
-    return name, str(rater["answers"]), str(rater["skipped"]), f"{rater['coverage']:.0%}", used
-
-
-def _told(found: dict[str, Any]) -> list[str]:
-    items, out = counted(found["items"], "item"), counted(found["open_requests"], "question")
-    return [
-        f"{items}, {found['rated']} of them rated, {found['complete']} by as many as wanted",
-        f"{found['answers']} of {found['wanted']} answers that are wanted; {out} given out and not answered yet",
-    ]
-
-
-def _next(found: dict[str, Any], folder: str) -> str:
-    if not found["raters"]:
-        return f"uard collect serve {folder} --raters ann,bob"
-    if found["answers"] < found["wanted"]:
-        return f"uard collect serve {folder}"
-    return f"uard collect export {folder} answers.csv"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -103,6 +103,17 @@ def tell_known(console: Console, before: set[str], items: Sequence[Item], remedy
         terminal.say(console, f"{few} in the project already{remedy}")
 
 
+def tell_unknown(console: Console, project: Project, items: Sequence[Item]) -> None:
+    """Warn of practice, gold and examples that are about no item of the project, and are not shown."""
+    warn_unknown(console, project.unknown(items))
+
+
+def warn_unknown(console: Console, unknown: Mapping[str, str]) -> None:
+    """Warn of what ``Project.unknown`` has found."""
+    for name, table in unknown.items():
+        terminal.warning(console, f"[[{table}]] names an item that is not in the project: {name}")
+
+
 def is_new(project: Project) -> bool:
     """Whether a project has no question yet."""
     from uard.collect.project import SETTINGS
@@ -127,10 +138,13 @@ def finish(
             told = f"these pay {paid[0]:.3g} .. {paid[1]:.3g}, and raters can say {low:g} .. {high:g}"
             terminal.warning(console, f"{told}: see low and high in {project.folder / 'project.toml'}")
     if project.question.kind == "pairs":
-        from uard.collect.texts import pairs
+        from uard.collect.texts import comparable, pairs
 
         few = len(items) if count is None and items and items[0].kind == "clip" else count
-        terminal.say(console, counted(len(pairs(items, project, few, seed)), "pair"))
+        made = pairs(items, project, few, seed) if comparable(items) else []
+        terminal.say(
+            console, counted(len(made), "pair") + ("" if made else ": others are made when raters ask for more")
+        )
     terminal.say(console, f"next: uard collect serve {project.folder} --raters ann,bob")
 
 

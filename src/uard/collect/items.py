@@ -151,6 +151,10 @@ def text_item(prompt: str, completion: str, *, reward: float | None = None, stra
         _checks.instance(name, text, str, "text")
         if len(text) > LONGEST_TEXT:
             raise _checks.InvalidValueError(f"len({name})", len(text), f"at most {LONGEST_TEXT} characters")
+        if any("\ud800" <= c <= "\udfff" for c in text):
+            raise _checks.InvalidValueError(
+                name, text, "text without halves of surrogate pairs, which no page can show"
+            )
     if not completion.strip():
         raise _checks.InvalidValueError("completion", completion, "text that is not empty")
     return Item(
@@ -180,7 +184,7 @@ def pair_item(one: str, other: str, *, stratum: str = "") -> Item:
     if one == other:
         raise _checks.InvalidValueError("other", other, "another item")
     left, right = sorted((one, other))
-    return Item({"kind": "pair", "left": left, "right": right, "stratum": _stratum(stratum)})
+    return Item({"kind": "pair", "left": left, "right": right, "stratum": _stratum(stratum, 2 * LONGEST + 3)})
 
 
 def item_of(as_json: str) -> Item:
@@ -188,10 +192,11 @@ def item_of(as_json: str) -> Item:
     return Item(cast("dict[str, Any]", json.loads(as_json)))
 
 
-def _stratum(name: str) -> str:
+def _stratum(name: str, most: int = LONGEST) -> str:
+    """Return a stratum's name; that of a pair may name those of both sides."""
     _checks.instance("stratum", name, str, "text")
-    if len(name) > LONGEST or (name and not name.isprintable()):
-        raise _checks.InvalidValueError("stratum", name, f"at most {LONGEST} printable characters")
+    if len(name) > most or not name.isprintable():
+        raise _checks.InvalidValueError("stratum", name, f"at most {most} printable characters")
     return name
 
 

@@ -21,6 +21,7 @@ from uard.ratings.log import bad_cell
 from uard.ratings.readers.columns import Choice, Numbers, name_of
 from uard.ratings.readers.formats import table
 from uard.ratings.readers.spelling import among
+from uard.ratings.table import LONGEST
 
 PROMPTS = ("prompt", "prompts", "question", "instruction", "query", "input")
 COMPLETIONS = (
@@ -65,6 +66,18 @@ def texts(path: str | Path, project: Project) -> list[Item]:
             and value of the first, and the rows of the others.
         StoreError: the project's database cannot be written.
     """
+    items = read_texts(path)
+    with closing(project.store()) as store:
+        store.add_items(items)
+    return items
+
+
+def read_texts(path: str | Path) -> list[Item]:
+    """Return the completions of a file, each once, without a project; see ``texts``.
+
+    Raises:
+        InvalidValueError: see ``texts``.
+    """
     source = str(path)
     choice = _Columns(source)
     with _long_cells():
@@ -81,10 +94,7 @@ def texts(path: str | Path, project: Project) -> list[Item]:
         for item in _items({name: column[row] for name, column in columns.items()}, layout, bad, row):
             found.setdefault(item.id, item)
     bad.check()
-    items = list(found.values())
-    with closing(project.store()) as store:
-        store.add_items(items)
-    return items
+    return list(found.values())
 
 
 def pairs(items: Iterable[Item], project: Project, count: int | None = None, seed: int = 0) -> list[Item]:
@@ -115,18 +125,29 @@ def pairs(items: Iterable[Item], project: Project, count: int | None = None, see
     if count is not None:
         _checks.whole("count", count, low=1)
     _checks.whole("seed", seed, low=0)
+    items = list(items)
+    groups = comparable(items)
+    if not groups:
+        allowed = "at least two clips, or two completions of one prompt"
+        raise _checks.InvalidValueError("items", f"{len({i.id for i in items if i.kind != 'pair'})} items", allowed)
+    found = [_pair(*two) for two in _drawn(groups, count, np.random.default_rng(seed))]
+    with closing(project.store()) as store:
+        store.add_items(found)
+    return found
+
+
+def comparable(items: Iterable[Item]) -> list[list[Item]]:
+    """Return the clips and texts that can stand beside each other, in groups of at least two.
+
+    Examples:
+        >>> len(comparable([text_item("2 + 2?", "4"), text_item("2 + 2?", "5"), text_item("3 + 3?", "6")]))
+        1
+    """
     groups: defaultdict[tuple[str, ...], dict[str, Item]] = defaultdict(dict)
     for item in items:
         if item.kind != "pair":
             groups[(item.kind, str(item.content.get("prompt", "")))][item.id] = item
-    comparable = [list(group.values()) for group in groups.values() if len(group) > 1]
-    if not comparable:
-        allowed = "at least two clips, or two completions of one prompt"
-        raise _checks.InvalidValueError("items", f"{sum(map(len, groups.values()))} items", allowed)
-    found = [_pair(*two) for two in _drawn(comparable, count, np.random.default_rng(seed))]
-    with closing(project.store()) as store:
-        store.add_items(found)
-    return found
+    return [list(group.values()) for group in groups.values() if len(group) > 1]
 
 
 def _drawn(groups: list[list[Item]], count: int | None, random: np.random.Generator) -> list[tuple[Item, Item]]:
@@ -228,6 +249,8 @@ def _items(row: Mapping[str, Any], layout: _Layout, bad: _Bad, number: int) -> l
     """Return the completions of a row; none of a bad one."""
     before = len(bad.cells)
     stratum = "" if layout.stratum is None else (name_of(row[layout.stratum]) or "")
+    if len(stratum) > LONGEST or not stratum.isprintable():
+        bad.add(number, str(layout.stratum), f"{stratum[:30]}...", f"at most {LONGEST} printable characters")
     prompt, answers = _conversation(row, layout, bad, number)
     found: list[Item] = []
     for column, completions in answers.items():
