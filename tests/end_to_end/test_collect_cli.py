@@ -11,7 +11,7 @@ import pytest
 
 from uard.cli import app as cli
 from uard.cli.projects import round_up
-from uard.collect import Project, sheets
+from uard.collect import Project, Request, sheets
 from uard.ratings.table import Answer
 
 
@@ -306,3 +306,115 @@ def test_hopper_is_recorded_without_a_screen(tmp_path):
     assert size == (256, 256)
     assert len(np.unique(frames[0].reshape(-1, 3), axis=0)) > 50  # something is to be seen
     assert (frames[0] != frames[-1]).any()
+
+
+def answered(folder, rater, value=1.0, **more):
+    """Answer all that a rater is asked."""
+    from uard.collect.asking import top_up
+
+    project = Project.open(folder)
+    with project.store() as store:
+        if rater not in {r.name for r in store.raters()}:
+            store.invite(rater)
+        while top_up(project, store, rater, 5):
+            for lease in store.lease(rater, 99):
+                sides = {side: lease.item.content[side] for side in ("left", "right") if lease.item.kind == "pair"}
+                said = {"kind": lease.kind, "given_at": 2.0} | sides | more
+                name = f"{rater}-{lease.id}"
+                store.put([Answer(name, lease.item.id, rater, None if more else value, **said)], lease.id)
+
+
+def edited(folder, **fields):
+    path = os.path.join(folder, "project.toml")
+    with open(path) as file:
+        lines = file.read().split("\n")
+    changed = [f"{n} = {fields[n]}" if (n := line.split(" = ")[0]) in fields else line for line in lines]
+    with open(path, "w") as file:
+        file.write("\n".join(changed))
+
+
+def test_the_next_step_is_the_export_when_all_that_was_asked_is_answered(run, tmp_path):
+    run("record", "TrapGrid6", "grid", "--segments", 9, "--length", 1)
+    items = [item.id for item in items_of("grid")]
+    edited("grid", overlap=2, repeats=0.5)
+    with open("grid/project.toml", "a") as file:
+        for name, table in zip(items, ("practice", "gold", "example"), strict=False):
+            file.write(f'\n[[{table}]]\nitem = "{name}"\nvalue = 0.0\n')
+    answered("grid", "ann")
+    code, out, err = run("status", "grid")
+    assert "6 items, 6 of them rated, 0 by as many as wanted" in out
+    assert "6 of 12 answers that are wanted; 0 questions given out" in out
+    assert err.endswith("next: uard collect serve grid --raters NAMES, for 1 more rater")
+    answered("grid", "bob", choice="skip")
+    code, out, err = run("status", "grid")
+    assert code == 0
+    assert "6 items, 6 of them rated, 6 by as many as wanted" in out
+    assert "12 of 12 answers that are wanted; 0 questions given out" in out
+    assert err.endswith("next: uard collect export grid answers.csv")
+    with Project.open("grid").store() as store:
+        store.ask([Request(items[5], "ann", "repeat")])
+    assert run("status", "grid")[2].endswith("next: uard collect serve grid")
+
+
+@pytest.mark.parametrize(
+    ("kind", "said", "reads"),
+    [
+        ("slider", {}, "raters"),
+        ("stars", {}, "raters"),
+        ("thumbs", {"choice": "up"}, "raters"),
+        ("pairs", {"choice": "left"}, "preferences"),
+        ("slider", {"choice": "skip"}, None),
+        ("pairs", {"choice": "cannot tell"}, None),
+    ],
+)
+def test_what_reads_an_export_is_named(run, kind, said, reads):
+    run("record", "TrapGrid6", "grid", "--segments", 4, "--length", 1, "--kind", kind, "--high", 2.0, "--low", -2.0)
+    for rater in ("ann", "bob"):
+        answered("grid", rater, 2.0, **said)
+    _, _, err = run("export", "grid", "said.csv")
+    assert (f". Next: uard {reads} said.csv" if reads else "answers in said.csv") in err
+    if reads is None:
+        assert "Next" not in err
+        return
+    cli.main([reads, "said.csv"])
+
+
+def test_texts_that_cannot_be_paired_make_no_project(run, tmp_path):
+    path = tmp_path / "t.jsonl"
+    path.write_text('{"prompt": "a", "completion": "b"}\n{"prompt": "c", "completion": "d"}\n')
+    code, _, err = run("texts", "t.jsonl", "talk", "--kind", "pairs")
+    assert code == 2
+    assert "--kind = 'pairs': must be another one: t.jsonl has no two completions of one prompt" in err
+    assert not (tmp_path / "talk").exists()
+    code, _, err = run("record", "TrapGrid6", "grid", "--kind", "pairs", "--segments", 1)
+    assert code == 2
+    assert "--segments = 1: must be a whole number >= 2" in err
+    assert not (tmp_path / "grid").exists()
+    path.write_text('{"prompt": "a", "completion": "b"}\n{"prompt": "a", "completion": "d"}\n')
+    assert "1 pair" in run("texts", "t.jsonl", "talk", "--kind", "pairs")[2]
+    path.write_text('{"prompt": "a", "completion": "new"}\n')
+    code, _, err = run("texts", "t.jsonl", "talk")
+    assert code == 0
+    assert "0 pairs: they are made when raters ask for more" in err
+
+
+def test_a_stratum_that_cannot_be_shown_is_named_by_its_row(run, tmp_path):
+    for name in ("\ud800", "a\nb", "m" * 1_000_000):
+        rows = [{"prompt": "a", "completion": "b", "model": m} for m in ("fine", name)]
+        (tmp_path / "t.jsonl").write_text("\n".join(json.dumps(row) for row in rows))
+        code, _, err = run("texts", "t.jsonl", "talk")
+        assert code == 2
+        assert "row 2, column model" in err.replace("'", "")
+        assert "at most 200 printable characters" in err
+        assert not (tmp_path / "talk").exists()
+
+
+def test_an_archive_has_a_state_and_an_export(run, tmp_path, monkeypatch):
+    run("record", "TrapGrid6", "grid", "--segments", 2, "--length", 1)
+    answered("grid", "ann")
+    monkeypatch.setattr("uard.collect.schema.is_read_only", lambda path: True)
+    assert "2 items, 2 of them rated" in run("status", "grid")[1]
+    assert "2 answers in said.csv" in run("export", "grid", "said.csv")[2]
+    code, _, err = run("invite", "grid", "bob")
+    assert code == 2
+    assert "Copy the project's whole folder to where it can be written" in err

@@ -69,10 +69,8 @@ def _with_numbers(answers: Answers, question: Question) -> Answers:
     worth = {"up": question.high, "down": question.low}
     if question.kind != "thumbs":
         return answers
-    plain = (a.value is None and a.choice in worth for a in answers)
-    return Answers(
-        tuple(replace(a, value=worth[str(a.choice)]) if p else a for a, p in zip(answers, plain, strict=True))
-    )
+    rows = (replace(a, value=worth[str(a.choice)]) if a.value is None and a.choice in worth else a for a in answers)
+    return Answers(tuple(rows))
 
 
 def _next(answers: Answers, question: Question, file: str) -> str:

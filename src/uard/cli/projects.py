@@ -142,9 +142,7 @@ def finish(
 
         few = len(items) if count is None and items and items[0].kind == "clip" else count
         made = pairs(items, project, few, seed) if comparable(items) else []
-        terminal.say(
-            console, counted(len(made), "pair") + ("" if made else ": others are made when raters ask for more")
-        )
+        terminal.say(console, counted(len(made), "pair") + ("" if made else ": they are made when raters ask for more"))
     terminal.say(console, f"next: uard collect serve {project.folder} --raters ann,bob")
 
 
