@@ -579,7 +579,7 @@ def test_what_a_browser_cannot_show_is_left_out_for_its_rater_and_then_for_all(m
     assert done == {t.id for t in TEXTS} - wrong, "she goes on with all others"
     assert ann.post("/api/next", json={"count": 2}).json()["progress"] == {"answered": 3, "open": 0}
     owner = site.owner()
-    assert "3 items that a browser cannot show" in owner.get("/owner").text
+    assert "3 items set aside for a rater" in owner.get("/owner").text
     shown = tasks(bob, 20)
     assert wrong <= {t["item"]["id"] for t in shown}, "others are asked until it is seen not to be hers alone"
     (task,) = [t for t in shown if t["item"]["id"] == TEXTS[0].id]
