@@ -157,11 +157,11 @@ def test_strata_of_an_old_store_are_cells_that_can_be_read(tmp_path):
     assert all(len(row["stratum"]) <= 200 for row in export.rows_of(said, items))
 
 
-@pytest.mark.parametrize("name", ["reward", "item", "rating", "id", "kind"])
+@pytest.mark.parametrize("name", ["reward", "item", "rating", "id", "kind", "Worker", "updated_at"])
 def test_an_attribute_of_an_old_store_destroys_no_column(name):
     said = Answers((rated("a1", "x", "ann", 0.25), rated("a1.1", "x", "ann", 0.5, attribute=name)))
     (row,), (plain,) = export.rows_of(said, ITEMS), export.rows_of(Answers(said.rows[:1]), ITEMS)
-    assert row == plain | {f"{name} (rated)": 0.5}
+    assert row == plain | {f"rated {name}": 0.5}
 
 
 def test_no_head_of_a_column_is_a_formula():

@@ -3,7 +3,7 @@
 import pytest
 
 from uard._checks import InvalidValueError
-from uard.collect.project import Known, Question, as_toml, question_of
+from uard.collect.question import Known, Question, as_toml, question_of
 
 X, Y = "0" * 32, "1" * 32
 
@@ -30,7 +30,15 @@ X, Y = "0" * 32, "1" * 32
         ({"repeats": 1.0}, "repeats = 1.0"),
         ({"practice": (Known(X, 9.0),)}, f"practice: value of item {X} = 9.0"),
         ({"gold": (Known(X, 0.5), Known(X, 0.5))}, "there only once"),
-        ({"kind": "thumbs", "gold": (Known(X, -1.0),)}, r"in \[0, 1\]"),
+        ({"kind": "thumbs", "gold": (Known(X, -1.0),)}, "1 or 0, for up or down"),
+        ({"kind": "thumbs", "practice": (Known(X, 0.5),)}, "1 or 0, for up or down"),
+        ({"kind": "pairs", "gold": (Known(X, 0.3),)}, r"1, 0 or 0\.5, for left, right or a tie"),
+        ({"gold": (Known(X, 0.5),), "practice": (Known(X, 0.5),)}, "none of practice and examples"),
+        ({"gold": (Known(X, 0.5),), "examples": (Known(X, 0.5),)}, "none of practice and examples"),
+        ({"attributes": ("Rating",)}, "other names than the columns"),
+        ({"attributes": ("worker id",)}, "would be read as one of them"),
+        ({"attributes": (" =1+1",)}, "not beginning with"),
+        ({"low": -1e300}, "low"),
     ],
 )
 def test_what_cannot_be_asked(fields, message):

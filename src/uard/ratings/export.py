@@ -8,10 +8,14 @@ import io
 import json
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import lru_cache
 from typing import Any
 
 from uard import _checks
 from uard._support.text import printable
+from uard.ratings.readers.columns import Wanted
+from uard.ratings.readers.layout import layout_of
+from uard.ratings.readers.spelling import normal
 from uard.ratings.table import FIELDS, LATEST, LONGEST, Answer, Answers, answer_of
 
 Contents = Mapping[str, Mapping[str, Any]]
@@ -94,7 +98,7 @@ def rows_of(answers: Answers, items: Contents) -> list[Row]:
         place = a.item, a.rater, given_with[a.id]
         row = rows.setdefault(place, _row(a, items.get(a.item, {})) | {"id": given_with[a.id]})
         if a.attribute:
-            column = f"{a.attribute} (rated)" if a.attribute in COLUMNS else a.attribute  # in a store of before
+            column = f"rated {a.attribute}" if is_taken(a.attribute) else a.attribute  # in a store of before
             row[column] = a.value
             attributes.append(column)
         else:
@@ -123,6 +127,27 @@ _COLUMNS = ("item", "rater", "rating", "left", "right", "choice", "reward", "str
 _AFTER = ("comment", "kind", "shown_at", "given_at", "id")
 COLUMNS = (*_COLUMNS, *_AFTER)
 """Names of the columns of ``rows_of``, which no attribute may have."""
+
+
+@lru_cache(maxsize=256)
+def is_taken(name: str) -> bool:
+    """Whether an attribute cannot be called so: it is a column's name, or would be read in the place of one.
+
+    Examples:
+        >>> is_taken("Reward"), is_taken("worker id"), is_taken("safe")
+        (True, True, False)
+    """
+    if normal(name) in {normal(column) for column in COLUMNS}:
+        return True
+    wanted = Wanted("export")
+    rated = tuple(column for column in COLUMNS if column not in ("left", "right", "choice"))
+    for columns in (rated, tuple(column for column in rated if column != "reward")):
+        try:
+            if layout_of((*columns, name), wanted) != layout_of(columns, wanted):
+                return True
+        except _checks.InvalidValueError:  # it could not be told which of two columns is meant
+            return True
+    return False
 
 
 def _row(answer: Answer, content: Mapping[str, Any]) -> Row:

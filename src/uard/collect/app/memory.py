@@ -6,7 +6,8 @@ import threading
 from collections import Counter, defaultdict
 
 from uard.collect.items import Item
-from uard.collect.project import MOST_ATTRIBUTES, Project
+from uard.collect.project import Project
+from uard.collect.question import MOST_ATTRIBUTES
 from uard.collect.store import AnswerStore, part_name
 from uard.ratings.table import Answer, Answers
 
