@@ -15,7 +15,7 @@ import pytest
 from uard._checks import InvalidValueError, UnknownNameError
 from uard.collect.items import clip_item, item_of, pair_item, text_item
 from uard.collect.sqlite import SQLiteStore
-from uard.collect.store import LEASE_SECONDS, ConflictError, LinkUsedError, Request, StoreError, hashed
+from uard.collect.store import LEASE_SECONDS, ConflictError, LinkUsedError, Request, StoreError, hashed, taken_back
 from uard.ratings.table import Answer
 
 ITEMS = [text_item("2 + 2?", str(i)) for i in range(6)]
@@ -272,6 +272,24 @@ def test_a_late_answer_counts(store, clock):
     store.put([said("b1", rater="bob")], taken.id)
     store.put([said("a1")], late.id)
     assert [a.rater for a in store.answers()[0]] == ["bob", "ann"]
+
+
+def test_a_late_answer_to_what_was_passed_on_can_be_corrected(store, clock):
+    store.ask([Request(X, "ann")])
+    (lease,) = store.lease("ann")
+    assert store.pass_on("bob", 1) == 0
+    clock.now += LEASE_SECONDS + 1
+    assert store.pass_on("bob", 1, without={X}) == 0
+    assert store.pass_on("bob", 1) == 1
+    assert store.lease("ann") == ()
+    (answer,) = store.put([said("a1", given_at=clock.now)], lease.id)
+    assert store.pass_on("ann", 1) == 0
+    store.put(taken_back([answer], "b1", source="page", now=clock.now))
+    (again,) = store.lease("ann")
+    assert (again.item.id, again.id == lease.id) == (X, False)
+    store.put([said("a2", value=0.5)], again.id)
+    assert [lease.item.id for lease in store.lease("bob")] == [X]
+    assert store.lease("ann") == ()
 
 
 def test_requests_name_what_is_there(store):

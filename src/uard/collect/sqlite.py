@@ -356,10 +356,15 @@ class SQLiteStore(AnswerStore):
         names = ", ".join(f'"{name}"' for name in FIELDS)
         db.execute(f"INSERT INTO answers ({names}) VALUES ({marks})", tuple(getattr(answer, name) for name in FIELDS))
         if answer.said is None and answer.source != "owner":
-            db.execute(
+            again = db.execute(
                 "UPDATE requests SET answer = NULL, held_by = ? WHERE answer = ?", (answer.rater, answer.supersedes)
             )
-            db.execute("UPDATE leases SET answer = NULL WHERE answer = ?", (answer.supersedes,))
+            leased = db.execute("UPDATE leases SET answer = NULL WHERE answer = ?", (answer.supersedes,))
+            if leased.rowcount and not again.rowcount:  # her question was passed on while her page still showed it
+                db.execute(
+                    "INSERT INTO requests (item, rater, kind, priority, held_until) VALUES (?, ?, 'rating', 0.0, ?)",
+                    (answer.item, answer.rater, answer.given_at + LEASE_SECONDS),
+                )
 
     def answers(self, after: int = 0) -> tuple[Answers, int]:
         """See ``AnswerStore``."""
