@@ -226,6 +226,13 @@ def test_an_export_must_have_a_form_and_destroys_nothing(run):
             code, _, err = run(*command)
             assert code == 2
             assert "must be another file than those of the project grid" in err
+    os.link(f"grid/media/{sheet}", "clip.csv")
+    os.symlink("grid", "link")
+    os.symlink("grid/project.toml", "question.csv")
+    for name in ("clip.csv", "link/project.toml", "question.csv", "grid/media/../answers.sqlite"):
+        code, _, err = run("status", "grid", "--json", name)
+        assert (code, "must be another file than those of the project grid" in err) == (2, True)
+    assert run("export", "grid", "grid/said.csv")[0] == run("export", "grid", "grid/said.csv")[0] == 0  # not ours
     os.link("grid/answers.sqlite", "other.csv")
     code, _, err = run("export", "grid", "other.csv")
     assert code == 2
@@ -259,6 +266,18 @@ def test_an_item_that_is_not_there_is_named(run, tmp_path):
     code, _, err = run("status", "grid")
     assert code == 0
     assert "[[gold]] names an item that is not in the project: 3f9a" in err
+    code, _, err = run("serve", "grid", "--port", 70_000)
+    assert code == 2
+    assert "[[gold]] names an item that is not in the project: 3f9a" in err
+
+
+def test_an_address_that_is_none_invites_nobody(run):
+    run("record", "TrapGrid6", "grid", "--segments", 2, "--length", 1)
+    code, _, err = run("simulate", "grid", "--url", "x")
+    assert code == 2
+    assert "url = 'x': must be an address such as" in err
+    with Project.open("grid").store() as store:
+        assert store.raters() == ()
 
 
 def test_a_store_of_another_version_is_left_alone(run, tmp_path):

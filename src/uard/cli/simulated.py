@@ -66,7 +66,7 @@ class Simulate:
         import numpy as np
 
         from uard.collect import Project
-        from uard.collect.simulate import Simulation, law_by_reward
+        from uard.collect.simulate import Simulation, Visitor, law_by_reward
         from uard.ratings.panels import as_panel
 
         for name, value in (("idle", self.idle), ("pause", self.pause)):
@@ -74,6 +74,7 @@ class Simulate:
         if self.answers is not None:
             _checks.whole("answers", self.answers, low=1)
         _checks.whole("seed", self.seed)
+        Visitor(self.url)  # an address that is none is refused before anybody is invited
         project = Project.open(self.project)
         project.outside(self.json, "json")
         panel = as_panel(self._scaled(project.question))

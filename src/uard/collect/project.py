@@ -120,9 +120,18 @@ class Project:
             return
         own, path = self.folder.resolve(), Path(target).resolve()
         names = (SETTINGS, LOCK, *(ANSWERS + ending for ending in ("", "-wal", "-shm", "-journal")))
-        if path in {own / name for name in names} or path == own / MEDIA or own / MEDIA in path.parents:
+        inside = path in {own / name for name in names} or path == own / MEDIA or own / MEDIA in path.parents
+        if inside or self._is_clip(path):
             raise _checks.InvalidValueError(field, target, f"another file than those of the project {self.folder}")
         files.prepare(target, field, *(own / name for name in names))
+
+    def _is_clip(self, path: Path) -> bool:
+        """Whether a file is one of a clip under another name; only then has it several."""
+        try:
+            found = path.stat()
+            return found.st_nlink > 1 and any(path.samefile(clip) for clip in (self.folder / MEDIA).iterdir())
+        except OSError:  # there is none yet
+            return False
 
     def unknown(self, items: Iterable[Item]) -> dict[str, str]:
         """Return the items that practice, gold or examples name and that are not there, each with the table's name."""
