@@ -16,7 +16,7 @@ from uard._checks import InvalidValueError, UnknownNameError
 from uard.collect.items import clip_item, item_of, pair_item, text_item
 from uard.collect.sqlite import SQLiteStore
 from uard.collect.store import LEASE_SECONDS, ConflictError, LinkUsedError, Request, StoreError, hashed, taken_back
-from uard.ratings.table import Answer
+from uard.ratings.table import LATEST, Answer
 
 ITEMS = [text_item("2 + 2?", str(i)) for i in range(6)]
 X, Y, *_ = (item.id for item in ITEMS)
@@ -264,6 +264,14 @@ def test_what_the_owner_takes_back_is_not_asked_again(store):
     assert store.lease("ann") == ()
 
 
+def test_a_time_that_no_calendar_has_stops_nobody(store):
+    store.put([said("a1")])
+    with sqlite3.connect(store.path) as db:
+        db.execute("UPDATE answers SET given_at = 1e12")
+    (answer,), _ = store.answers()
+    assert answer.given_at == LATEST
+
+
 def test_a_late_answer_counts(store, clock):
     store.ask([Request(X)])
     (late,) = store.lease("ann")
@@ -384,7 +392,7 @@ def test_threads_share_a_store(store):
 WRITER = """
 import sys
 from uard.collect.sqlite import SQLiteStore
-from uard.ratings.table import Answer
+from uard.ratings.table import LATEST, Answer
 file, rater, item = sys.argv[1:]
 store = SQLiteStore(file)
 for i in range(100_000):

@@ -9,13 +9,12 @@ import threading
 import time
 from collections.abc import Callable, Collection, Generator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, final
 
 from uard import _checks
-from uard.collect import schema
+from uard.collect import recorded, schema
 from uard.collect.items import Item, item_of
 from uard.collect.store import (
     LEASE_SECONDS,
@@ -27,8 +26,6 @@ from uard.collect.store import (
     Request,
     StoreError,
     hashed,
-    part_name,
-    taken_back,
 )
 from uard.ratings.table import FIELDS, LONGEST, Answer, Answers
 
@@ -210,12 +207,12 @@ class SQLiteStore(AnswerStore):
     def ask(self, requests: Sequence[Request], after: int | None = None) -> int:
         """See ``AnswerStore``."""
         with self._changing() as db:
-            if after is not None and _last_request(db) != after:
+            if after is not None and recorded.last_request(db) != after:
                 return 0
             for r in requests:
-                _expect(db, "items", "id", r.item, "item")
+                recorded.expect(db, "items", "id", r.item, "item")
                 if r.rater is not None:
-                    _expect(db, "raters", "name", r.rater, "rater")
+                    recorded.expect(db, "raters", "name", r.rater, "rater")
                 until = None if r.rater is None else self._clock() + LEASE_SECONDS  # so long it is hers alone
                 db.execute(
                     "INSERT INTO requests (item, rater, kind, priority, held_until) VALUES (?, ?, ?, ?, ?)",
@@ -226,7 +223,9 @@ class SQLiteStore(AnswerStore):
     def open_requests(self) -> tuple[tuple[Request, ...], int]:
         """See ``AnswerStore``."""
         with self._reading() as db:
-            place = _last_request(db)  # first: one that comes between the two is then not thought to have been read
+            place = recorded.last_request(
+                db
+            )  # first: what comes between the two is then not thought to be read
             rows = db.execute(
                 "SELECT item, rater, kind, priority FROM requests WHERE answer IS NULL AND seq <= ? ORDER BY seq",
                 (place,),
@@ -322,13 +321,13 @@ class SQLiteStore(AnswerStore):
         if not answers:
             raise _checks.InvalidValueError("answers", answers, "at least one")
         with self._changing() as db:
-            known = [_stored(db, a.id) for a in answers]
+            known = [recorded.stored(db, a.id) for a in answers]
             if known[0] is not None:
                 for a, there in zip(answers, known, strict=True):
-                    if there is None or _differs(there, a):
+                    if there is None or recorded.differs(there, a):
                         raise ConflictError(f"another answer is stored as {a.id!r}")
                 return tuple(a for a in known if a is not None)
-            rows = list(answers) if lease is None else _about_lease(db, answers, lease)
+            rows = list(answers) if lease is None else recorded.about_lease(db, answers, lease)
             for a in rows:
                 self._add(db, a)
             if lease is not None:
@@ -342,12 +341,12 @@ class SQLiteStore(AnswerStore):
 
     @staticmethod
     def _add(db: sqlite3.Connection, answer: Answer) -> None:
-        if _stored(db, answer.id) is not None:
+        if recorded.stored(db, answer.id) is not None:
             raise ConflictError(f"another answer is stored as {answer.id!r}")
-        _expect(db, "items", "id", answer.item, "item")
-        _expect(db, "raters", "name", answer.rater, "rater")
+        recorded.expect(db, "items", "id", answer.item, "item")
+        recorded.expect(db, "raters", "name", answer.rater, "rater")
         if answer.supersedes is not None:
-            before = _stored(db, answer.supersedes)
+            before = recorded.stored(db, answer.supersedes)
             if before is None or (before.rater, before.item) != (answer.rater, answer.item):
                 raise ConflictError(f"{answer.rater} has given no answer {answer.supersedes!r} about this item")
             if db.execute("SELECT 1 FROM answers WHERE supersedes = ?", (before.id,)).fetchone():
@@ -370,64 +369,4 @@ class SQLiteStore(AnswerStore):
         """See ``AnswerStore``."""
         with self._reading() as db:
             rows = db.execute("SELECT * FROM answers WHERE seq > ? ORDER BY seq", (after,)).fetchall()
-        return Answers(tuple(_answer_of(row) for row in rows)), rows[-1]["seq"] if rows else after
-
-
-def _last_request(db: sqlite3.Connection) -> int:
-    return int(db.execute("SELECT coalesce(max(seq), 0) FROM requests").fetchone()[0])
-
-
-def _about_lease(db: sqlite3.Connection, answers: Sequence[Answer], lease: str) -> list[Answer]:
-    """Return answers as they are stored for a lease: of its kind, and in place of what was said of it before.
-
-    Two tabs, or a page whose answer came late, may both answer one lease. What comes last stands, whichever it is, and
-    it is no hidden repeat.
-    """
-    row = db.execute(
-        "SELECT l.rater, l.answer, r.item, r.kind FROM leases AS l JOIN requests AS r ON r.seq = l.request "
-        "WHERE l.id = ?",
-        (lease,),
-    ).fetchone()
-    first = answers[0]
-    if row is None or (row["rater"], row["item"]) != (first.rater, first.item):
-        raise ConflictError(f"{first.rater} was not shown this item under this lease")
-    parts = db.execute(
-        "SELECT * FROM answers AS a WHERE item = :item AND rater = :rater "
-        "AND (id = :said OR substr(id, 1, length(:said) + 1) = :said || '.') "
-        "AND (value IS NOT NULL OR choice IS NOT NULL) "
-        "AND NOT EXISTS (SELECT 1 FROM answers AS b WHERE b.supersedes = a.id) ORDER BY seq",
-        {"item": first.item, "rater": first.rater, "said": row["answer"]},
-    ).fetchall()
-    before = {part["attribute"]: _answer_of(part) for part in parts}
-    rows = [replace(a, kind=row["kind"]) for a in answers]
-    rows = [replace(a, supersedes=a.supersedes or _name(before.pop(a.attribute, None))) for a in rows]
-    silent = taken_back(list(before.values()), first.id, source=first.source, now=first.given_at)
-    return rows + [replace(a, id=part_name(first.id, len(rows) + k)) for k, a in enumerate(silent)]
-
-
-def _name(answer: Answer | None) -> str | None:
-    return None if answer is None else answer.id
-
-
-def _stored(db: sqlite3.Connection, name: str) -> Answer | None:
-    row = db.execute("SELECT * FROM answers WHERE id = ?", (name,)).fetchone()
-    return None if row is None else _answer_of(row)
-
-
-def _answer_of(row: sqlite3.Row) -> Answer:
-    return Answer(**{name: row[name] for name in FIELDS})
-
-
-def _differs(there: Answer, sent: Answer) -> bool:
-    """Whether two answers of one name are not the same: of another content, or in place of another.
-
-    Times differ when it is sent again; what the store itself has decided (the kind, what it takes the place of) is not
-    known to who sends it.
-    """
-    left_to_us = {"shown_at", "given_at", "kind"} | ({"supersedes"} if sent.supersedes is None else set[str]())
-    return any(getattr(there, name) != getattr(sent, name) for name in FIELDS if name not in left_to_us)
-
-
-def _expect(db: sqlite3.Connection, table: str, column: str, value: str, what: str) -> None:
-    if db.execute(f"SELECT 1 FROM {table} WHERE {column} = ?", (value,)).fetchone() is None:
-        raise ConflictError(f"there is no {what} {value!r} in this store")
+        return Answers(tuple(recorded.answer_of(row) for row in rows)), rows[-1]["seq"] if rows else after
