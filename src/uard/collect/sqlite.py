@@ -223,9 +223,7 @@ class SQLiteStore(AnswerStore):
     def open_requests(self) -> tuple[tuple[Request, ...], int]:
         """See ``AnswerStore``."""
         with self._reading() as db:
-            place = recorded.last_request(
-                db
-            )  # first: what comes between the two is then not thought to be read
+            place = recorded.last_request(db)  # first: what comes between the two is then not thought to be read
             rows = db.execute(
                 "SELECT item, rater, kind, priority FROM requests WHERE answer IS NULL AND seq <= ? ORDER BY seq",
                 (place,),
