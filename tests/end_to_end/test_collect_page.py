@@ -19,7 +19,18 @@ from uard.collect.project import Known
 SERVE = "import sys, json; from uard.collect.serving import serve; serve(sys.argv[1], **json.loads(sys.argv[2]))"
 PASSWORD = "open sesame"
 MARKUP = "<b>bold</b>\n\n  <script>document.title = 'hacked'</script> & <img src=x onerror=alert(1)>"
-EXPECTED = ("ERR_INTERNET_DISCONNECTED", "ERR_CONNECTION_REFUSED", "ERR_CONNECTION_RESET", "ERR_EMPTY_RESPONSE")
+# What a browser notes of a network that is cut, or of a server that is killed, before, in and after an answer.
+EXPECTED = (
+    "ERR_INTERNET_DISCONNECTED",
+    "ERR_CONNECTION_REFUSED",
+    "ERR_CONNECTION_RESET",
+    "ERR_CONNECTION_CLOSED",
+    "ERR_CONNECTION_ABORTED",
+    "ERR_SOCKET_NOT_CONNECTED",
+    "ERR_EMPTY_RESPONSE",
+    "ERR_CONTENT_LENGTH_MISMATCH",
+    "ERR_INCOMPLETE_CHUNKED_ENCODING",
+)
 CONFLICT = "409 (Conflict)"  # what a browser notes of an answer that is not accepted
 FRAMES, COLUMNS, SIZE = 12, 4, 96
 
