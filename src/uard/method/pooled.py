@@ -20,7 +20,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from uard.method.arrays import Array, Numbers, namespace
+import numpy as np
+
+from uard.method.arrays import Array, Numbers, all_true, dot, least, namespace, total
 from uard.method.feedback import ByRater
 from uard.method.rater_statistics import RaterStatistics, error_of_means
 from uard.method.uncertainty import root
@@ -110,20 +112,21 @@ def pool(
     shrunk = 1.0 + tau2[..., None] * sums.weight
     weight = sums.weight / shrunk  # 1 / (v + tau^2)
     first = weight * sums.gap
-    total, first, second = weight.sum(-1), first.sum(-1), (sums.first - first) * sums.gap
-    anybody = total > 0
-    precision = xp.where(anybody, total, 1.0)
+    second = sums.first - first
+    precision, first = total(weight), total(first)
+    anybody = precision > 0
+    determinants = total(xp.log(shrunk)) + xp.log(1.0 + span * span * precision)
+    precision = _where(anybody, precision, 1.0)
     gap = first / precision
-    # Both hypotheses' squares are about the reward: those about the centre are total * gap^2 less.
-    squares = second.sum(-1) + first * gap
-    determinants = xp.log(shrunk).sum(-1) + xp.log(1.0 + span * span * total)
+    # Both hypotheses' squares are about the reward: those about the centre are precision * gap^2 less.
+    squares = dot(second, sums.gap) + first * gap
     return Pool(
         heard=sums.heard,
-        centre=xp.where(anybody, reward + gap, 0.0),
+        centre=_where(anybody, reward + gap, 0.0),
         tau=root(tau2),
-        error=xp.where(anybody, 1.0 / xp.sqrt(precision), 0.0),
-        lowest=xp.where(anybody, reward + xp.min(xp.where(here, sums.gap, xp.inf), axis=-1), 0.0),
-        log_odds=xp.where(anybody, 0.5 * (squares - determinants), 0.0),
+        error=_where(anybody, 1.0 / xp.sqrt(precision), 0.0),
+        lowest=_where(anybody, reward + least(_where(here, sums.gap, xp.inf)), 0.0),
+        log_odds=_where(anybody, 0.5 * (squares - determinants), 0.0),
     )
 
 
@@ -209,7 +212,7 @@ def precise_mean(
     """
     xp = namespace(said)
     sums = _sums(said, xp.zeros_like(said[..., 0]), here, variance)
-    return sums.first.sum(-1) / xp.where(sums.heard > 0, sums.total, 1.0)
+    return total(sums.first) / _where(sums.heard > 0, sums.total, 1.0)
 
 
 class _Sums(NamedTuple):
@@ -228,19 +231,26 @@ def _sums(
     here: Bool[Array, "*batch K"],
     variance: Float[Array, "*batch K"],
 ) -> _Sums:
-    xp = namespace(said)
-    weight, gap = xp.where(here, 1.0 / variance, 0.0), xp.where(here, said - about[..., None], 0.0)
-    # The method, not xp.sum, for speed: streams of one step live here.
-    return _Sums(here.sum(-1, dtype=said.dtype), weight, gap, weight * gap, weight.sum(-1))
+    weight, gap = 1.0 / variance, said - about[..., None]
+    if all_true(here):
+        heard = np.full(gap.shape[:-1], gap.shape[-1], gap.dtype)
+    else:
+        xp, heard = namespace(said), here.sum(-1, dtype=said.dtype)
+        weight, gap = xp.where(here, weight, 0.0), xp.where(here, gap, 0.0)
+    return _Sums(heard, weight, gap, weight * gap, total(weight))
 
 
 def _variance_between(s: _Sums) -> Float[Array, "*batch"]:
-    xp = namespace(s.total)
     several = s.heard > 1.0
-    total = xp.where(several, s.total, 1.0)
-    first, second = s.first.sum(-1), (s.first * s.gap).sum(-1)
-    excess = second - first * first / total - (s.heard - 1.0)
-    squares = (s.weight * (s.weight / total[..., None])).sum(-1)  # no square: of tiny rewards it overflows
-    spread = total - squares
+    whole = _where(several, s.total, 1.0)
+    first, second = total(s.first), dot(s.first, s.gap)
+    excess = second - first * first / whole - (s.heard - 1.0)
+    squares = dot(s.weight, s.weight / whole[..., None])  # no square: of tiny rewards it overflows
+    spread = whole - squares
     several = several & (spread > 0)  # where one rater outweighs all others by more than a float can tell it is not
-    return xp.where(several & (excess > 0), excess / xp.where(several, spread, 1.0), 0.0)
+    return _where(several & (excess > 0), excess / _where(several, spread, 1.0), 0.0)
+
+
+def _where(mask: Bool[Array, "*any"], yes: Array, no: float) -> Array:
+    """Return ``yes``, with a number where the mask is not true."""
+    return yes if all_true(mask) else namespace(yes).where(mask, yes, no)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from uard.method.arrays import Array, Numbers, namespace, smallest
+from uard.method.arrays import Array, Numbers, at_least, namespace, smallest
 from uard.method.feedback import ByRater
 from uard.method.uncertainty import masked_mean, root
 
@@ -131,9 +131,7 @@ def error_of_means(by_rater: ByRater, statistics: RaterStatistics) -> Float[Arra
         by_rater: What each rater has said here; where nothing was said the variance is that of one answer.
         statistics: Of the panel.
     """
-    xp, n = namespace(by_rater.mean), by_rater.count
-    one = xp.ones_like(n)
-    n = xp.maximum(n, one)
+    n = at_least(by_rater.count, 1.0)
     return (4.0 * statistics.noise + by_rater.m2) / ((n + 3.0) * n) + statistics.idiosyncrasy + statistics.floor
 
 

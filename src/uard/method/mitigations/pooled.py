@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from uard import _checks
 from uard.method import pooled, rater_statistics
-from uard.method.arrays import Array, namespace
+from uard.method.arrays import Array, all_true, namespace, within
 from uard.method.feedback import ByRater, Feedback
 from uard.method.mitigations.protocol import Evidence, Explanation, LearningSignal, Mitigation
 from uard.method.mitigations.robust import each_rater, flattened
@@ -115,14 +115,16 @@ class PooledDiscounting(Mitigation):
             here = pooled.overruled(said, here, variance, raters.noise, self.vetoes)
         p = pooled.pool(r, said, here, variance, raters.span)
         prior = self.lies / (1.0 - self.lies)
-        odds = prior * xp.exp(xp.clip(p.log_odds, -pooled.LARGEST_ODDS, pooled.LARGEST_ODDS))
+        odds = prior * xp.exp(within(p.log_odds, pooled.LARGEST_ODDS))
         w = 1.0 / (1.0 + odds)
         deviation = xp.sqrt(odds) * w  # sqrt(w (1 - w)), with a finite gradient
         b = xp.maximum(p.centre - self.contest * p.tau, p.lowest) - self.caution * p.error
         learned = b + w * (r - b) - self.risk * deviation * abs(r - b)
+        rated = p.heard > 0
+        if all_true(rated):
+            return learned, w, b, p.tau
         u = statistics.usual
         unrated = xp.minimum(r, u + self.unrated_weight * (r - u)) - self.risk * doubt
-        rated = p.heard > 0
         return (
             xp.where(rated, learned, unrated),
             xp.where(rated, w, 0.0 * w + self.unrated_weight),
