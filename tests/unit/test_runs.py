@@ -1,5 +1,9 @@
 """Many runs in one program: on a CPU one after the other, on a GPU side by side."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import numpy as np
 import pytest
@@ -51,3 +55,42 @@ def test_programs_are_forgotten_before_a_process_has_too_many(monkeypatch):
         xla.make_room(program)
     assert cleared == [{"a", "b"}]
     assert xla._held == {"c", "b"}
+
+
+TRAINED = """
+import jax
+seen = []
+jax.monitoring.register_event_listener(lambda event, **_: seen.append(event.rpartition("/")[2]))
+from uard.agents.tabular import QLearning
+from uard.envs.grids.trapgrid import TrapGrid
+from uard.lab.cell import Cell
+from uard.lab.execution import runner
+from uard.lab.execution.store import Store
+from uard.training import xla
+xla._WORTH_KEEPING = 0.0  # on a fast machine, too
+runner.run([(Cell(TrapGrid(size=4, traps=((1, 2),), horizon=8), episodes=5), 0)], Store(":memory:"), workers=1)
+print(seen.count("cache_hits"), seen.count("cache_misses"))
+"""
+
+
+def test_a_second_process_compiles_nothing(tmp_path):
+    env = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"} | {"XDG_CACHE_HOME": str(tmp_path)}
+
+    def trained():
+        done = subprocess.run([sys.executable, "-c", TRAINED], env=env, capture_output=True, text=True, check=True)
+        return [int(x) for x in done.stdout.split()]
+
+    hits, compiled = trained()
+    assert (hits, compiled > 0) == (0, True)
+    assert trained() == [compiled, 0]
+    (folder,) = (tmp_path / "uard" / "xla").iterdir()
+    assert folder.name == xla._processor()
+
+
+def test_programs_are_not_kept_where_nothing_can_be_written(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    before = jax.config.jax_compilation_cache_dir
+    xla.keep_programs()
+    assert jax.config.jax_compilation_cache_dir == before

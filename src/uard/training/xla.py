@@ -13,7 +13,9 @@ process itself trains. Several runs fill the cores, a process each.
 
 from __future__ import annotations
 
+import hashlib
 import os
+import platform
 import warnings
 from pathlib import Path
 from typing import Any
@@ -26,15 +28,20 @@ _THREADS = "NPROC"  # XLA takes so many threads instead of one per core
 COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
 
 
+_MOST = 1_000_000_000  # bytes of kept programs; what was not used for longest goes first
+_WORTH_KEEPING = 0.3  # seconds of compilation
+
+
 def keep_programs() -> None:
     """Keep compiled programs on disk, so that a program of half a minute's compilation is compiled once per machine.
 
-    In the user's cache folder, unless ``JAX_COMPILATION_CACHE_DIR`` names another; left out where nothing can be
-    written.
+    In the user's cache folder, at most ``_MOST`` bytes, unless ``JAX_COMPILATION_CACHE_DIR`` names another folder; left
+    out where nothing can be written. A program is native code for the processor that compiled it, so that a home that
+    several machines share has a folder for each kind of processor.
     """
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "uard" / "xla"
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "uard" / "xla" / _processor()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
@@ -44,7 +51,19 @@ def keep_programs() -> None:
     import jax
 
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 2.0)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING)
+    jax.config.update("jax_compilation_cache_max_size", _MOST)
+
+
+def _processor() -> str:
+    """Return a short name of this kind of processor: its architecture, and a digest of what it can do."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:  # not Linux
+        text = platform.processor()
+    features = sorted({line for line in text.splitlines() if line.startswith(("flags", "Features", "model name"))})
+    digest = hashlib.sha256("\n".join(features or [text]).encode()).hexdigest()
+    return f"{platform.machine()}-{digest[:12]}"
 
 
 HELD = 16  # programs that a process keeps

@@ -44,7 +44,9 @@ class Tabular(Trainer):
     def train(self, batch: Sequence[tuple[Cell, int]], folder: Path | None = None) -> list[Finish]:
         """Train a batch."""
         from uard.training.compiled import tabular
+        from uard.training.xla import keep_programs
 
+        keep_programs()
         tables: dict[Cell, Any] = {}
         runs = []
         for cell, seed in batch:
