@@ -121,3 +121,22 @@ def test_an_ignored_signal_stays_ignored():
     code = "import signal, time; signal.signal(2, signal.SIG_IGN); from uard._support import signals\n"
     process = start(code + "with signals.ending(): print(signal.getsignal(2) == signal.SIG_IGN)")
     assert process.communicate(timeout=30) == ("True\n", "")
+
+
+@pytest.mark.parametrize("number", CODES)
+def test_a_page_that_is_served_ends_by_one_signal_without_alarm(number, tmp_path):
+    """The server takes the signal, closes, and raises it again: that is no second one of the user's."""
+    pytest.importorskip("uvicorn")
+    (tmp_path / "texts.jsonl").write_text('{"prompt": "2 + 2", "completion": "4"}\n')
+    subprocess.run(
+        [sys.executable, "-c", MAIN, "collect", "texts", "texts.jsonl", "sums"],
+        cwd=tmp_path,
+        check=True,
+        capture_output=True,
+    )
+    process = start(MAIN, "collect", "serve", "sums", "--port", "0", cwd=tmp_path)
+    while "Ctrl-C" not in (line := process.stdout.readline()):
+        assert line, process.stderr.read()
+    code, seconds, _, error = end(process, number)
+    assert (code, seconds < MOST) == (CODES[number], True)
+    assert error == f"{'terminated' if number is signal.SIGTERM else 'interrupted'}\n"

@@ -4,8 +4,9 @@ The first signal raises ``StopError`` wherever the main thread is. That may be t
 between two steps of its own, not while XLA compiles for a minute; and an exception that is raised inside a callback of
 JAX or a destructor is swallowed there. So the signal is also remembered, for ``check`` in loops, and a watcher, who is
 told by the operating system and not by the handler, ends the process after ``GRACE`` seconds. A second signal ends it
-at once. Ending so is safe: files are replaced whole, a store is whole after any write, workers end with their parent,
-and what a dead process had claimed is free.
+at once, unless it is the first one that a handler of somebody else's (uvicorn's) raises again for us. Ending so is
+safe: files are replaced whole, a store is whole after any write, workers end with their parent, and what a dead process
+had claimed is free.
 """
 
 from __future__ import annotations
@@ -85,9 +86,13 @@ def _stop(number: int, _: object) -> None:
 
 def _watch(read: int) -> None:
     """End the process some time after the first signal, or with the second."""
-    first = _next(read, None)
+    first = number = _next(read, None)
     if first is not None:
-        _next(read, time.monotonic() + GRACE)
+        deadline = time.monotonic() + GRACE
+        while number is not None and signal.getsignal(number) is not _stop:
+            number = _next(read, deadline)  # a server's handler has it, which raises it again for us when all is closed
+        if number is not None:
+            _next(read, time.monotonic() + GRACE)
         with suppress(OSError, ValueError):
             if select.select([], [2], [], 0)[1]:  # else the message would wait, for ever perhaps
                 cursor = b"\x1b[?25h" if os.isatty(2) else b""  # which a progress bar has hidden
