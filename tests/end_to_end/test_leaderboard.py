@@ -110,7 +110,7 @@ def test_text_of_others_is_shown_and_never_obeyed(browser, tmp_path):
 
 
 def column(page, name, table="table.lines"):
-    cells = page.locator(table).first.locator(f"tbody tr:visible td:nth-child({HEADS.index(name) + 1})")
+    cells = page.locator(table).first.locator(f"tbody tr:visible > :nth-child({HEADS.index(name) + 1})")
     return cells.all_inner_texts()
 
 

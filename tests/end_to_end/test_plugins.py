@@ -440,7 +440,7 @@ def test_sections_of_packages_join_the_report(broken, tmp_path):
     good, bad = sections.of_packages(results, [sections.Section("made", "How this was made", 1000, "")])
     (section,) = (s for s in good if s.id == "example")
     assert "a random walker, 6x6" in section.html
-    assert section.losses == ("Nobody has tried uard on bells of 1000.",)
+    assert [loss.sentence() for loss in section.losses] == ["bells: nobody has tried uard on bells of 1000."]
     why = {error.plugin.name: str(error) for error in bad}
     assert "AttributeError" in why["gone"]
     assert "study = 'no such study': must be one of" in why["late"]
@@ -456,6 +456,8 @@ def test_sections_of_packages_join_the_report(broken, tmp_path):
         ({"css": "</style>"}, "css = '</style>': must be without </style>"),
         ({"files": {"../up": ""}}, "files = '../up': must be a plain name"),
         ({"files": {"index.html": ""}}, "files = 'index.html': must be a plain name, none of index.html"),
+        ({"page": "other.html"}, "page = 'other.html': must be one of index.html, paper.html, numbers.html"),
+        ({"losses": ("It hacks.",)}, "losses = 'It hacks.': must be of uard.lab.views.losses.Loss"),
     ],
 )
 def test_silly_sections_are_refused(fields, says):

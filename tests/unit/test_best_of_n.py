@@ -150,11 +150,21 @@ def test_losses_are_found_by_rule(small):
         lift = 0.2 if (c["panel"], c["method"]) == ("contested", "mean") else -0.2
         c["over_uard"]["ci95"] = [[lift - 0.1, lift + 0.1]] * len(data["n"])
         c["over_uard"]["mean"] = [lift] * len(data["n"])
-    sentences = dict(zip(PANELS, views.losses(data), strict=True))
-    assert "worth more than uard: mean at n = 10: +0.200 [+0.100, +0.300]; mean at n = 100" in sentences["contested"]
-    assert "nothing is worth more than uard" in sentences["independent"]
+    (better,) = (x for x in views.losses(data) if x.kind == "beaten")
+    assert better.where == "contested reward models, n = 10"
+    assert better.what == "the answers that mean chooses are worth more, at n = 10, 100, 1000, 10000"
+    ours, mean = (
+        c for name in ("uard", "mean") for c in data["curves"] if (c["panel"], c["method"]) == ("contested", name)
+    )
+    i = data["n"].index(10)
+    assert (better.ours.mean, better.theirs.mean) == (ours["gold"]["mean"][i], mean["gold"]["mean"][i])
+    falls = [x.where.split()[0] for x in views.losses(data) if x.kind == "fails"]
+    curves = {c["panel"]: c["gold"]["mean"] for c in data["curves"] if c["method"] == "uard"}
+    assert falls == [panel for panel, gold in curves.items() if max(gold) > gold[-1]]
     assert len(views.table(data).rows) == len(PANELS) * len(METHODS)
-    assert len(views.figure(data).axes) == len(PANELS)
+    drawn = views.picture_of(data)
+    assert len(drawn.figure.axes) == len(PANELS)
+    assert {row[3] for row in drawn.rows} == {*METHODS, "uard: score"}
 
 
 def test_what_is_published_was_made_by_this_problem():

@@ -74,7 +74,11 @@ def test_rivals_by_hand():
     assert excess.gap.mean == pytest.approx(-0.005)
     assert lcb.p == pytest.approx(2 / 1024, abs=0.0015)
     assert (lcb.corrected, excess.p, excess.corrected) == (pytest.approx(2 * lcb.p), 1.0, 1.0)
-    assert "less regret has excess 0.045" in panels.losses(by_hand())[0]
+    first, kind = panels.losses(by_hand())
+    assert (first.kind, first.against, first.where, first.of) == ("no better", "excess", "all panels", 2)
+    assert (first.ours.mean, first.theirs.mean) == (pytest.approx(0.05), pytest.approx(0.045))
+    assert first.sure == "not told apart, p = 1 of 2 (Holm)"
+    assert (kind.where, kind.of) == ("some repeating the proxy (5 scenarios)", 2)
 
 
 def test_what_is_published_in_brief_gives_the_same_regrets():

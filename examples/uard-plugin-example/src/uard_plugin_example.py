@@ -15,6 +15,7 @@ from uard.envs.base import TableEnvironment
 from uard.envs.tables import HiddenTruth, Task
 from uard.lab.cell import Cell
 from uard.lab.study import Study, row
+from uard.lab.views.losses import Loss
 from uard.lab.views.sections import Section
 from uard.lab.views.study_results import StudyResults
 from uard.lab.views.tables import Table, full
@@ -130,4 +131,5 @@ def sections(results: StudyResults) -> list[Section]:
     (walker, *_) = results.studies["control"].rows
     rows = (("a random walker, 6x6", full(results.of(walker.cell, "hacks"))),)
     shown = table(Table("What nobody has to learn", ("who", "trap visits per episode"), rows))
-    return [Section("example", "An example", 200, shown, losses=("Nobody has tried uard on bells of 1000.",))]
+    lost = Loss("fails", "bells", "nobody has tried uard on bells of 1000")
+    return [Section("example", "An example", 250, shown, losses=(lost,))]

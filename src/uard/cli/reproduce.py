@@ -125,7 +125,7 @@ class Reproduce:
             for table in panels.tables(found):
                 terminal.show(table)
             return
-        written = page.write_page(Path(self.report), [panels.section(study, found, seeds)], seeds)
+        written = page.write_pages(Path(self.report), page.of_panels(study, found, seeds), seeds)
         terminal.say(console, f"report: {written}")
 
     def _show_own(self, study: Study, store: Store) -> None:

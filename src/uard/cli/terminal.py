@@ -99,7 +99,7 @@ def _plain(columns: Sequence[str], rows: Sequence[Sequence[str]], title: str, la
 
 def show(data: Table, out: Console | None = None) -> None:
     """Print a table of the laboratory's."""
-    table(data.columns, data.rows, data.title, data.labels, out=out)
+    table(data.columns, data.texts(), data.title, data.labels, out=out)
 
 
 def glossary(title: str, entries: Mapping[str, str]) -> None:

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from uard.lab import statistics
 from uard.lab.result import CALIBRATION, RATING_ERROR
 from uard.lab.study import Row
 from uard.lab.trainers.examine import WINDOWS
-from uard.lab.views.figures import COLOURS as PALETTE
-from uard.lab.views.figures import axes_of, data_uri
+from uard.lab.views.figures import Chart, Picture, made_by
+from uard.lab.views.losses import Loss, of_family
+from uard.lab.views.palette import DASHED, DOTTED, look
 from uard.lab.views.published import BIN, Published, packaged_json
-from uard.lab.views.tables import Table, brief, full
+from uard.lab.views.tables import Cell, Table, brief
 from uard.replication import distortion, figures, paper
 from uard.replication.studies.derive import SIGMA_QUALITY
 
 AGENT = {"DQN": "dqn", "CQL": "cql", "CPO": "cpo", "TRPO": "trpo"}  # of the paper's Table 3
 OURS = "uard"
-COLOURS = {
-    "dqn": "#c1272d", "ensemble-dqn": "#e08214", "cql": "#8c6d31", "sunrise": "#d6589f", "ppo": "#2c6fbb",
-    "trpo": "#17a2b8", "cpo": "#7b4fa3", "cpo-oracle": "#b9a0d0", "sac": "#444444", "edac": "#999933",
-}  # fmt: skip
 
 
 def tables(p: Published) -> list[Table]:
@@ -36,13 +32,13 @@ def _visits(p: Published, r: Row) -> str:
 
 
 def _baselines(p: Published) -> Table:
-    rows: list[tuple[str, ...]] = []
+    rows: list[tuple[Cell, ...]] = []
     for printed in paper.TABLE_3:
         mean, sd = printed.visits.mean / 100, printed.visits.sd / 100
         rows.append((printed.method, "paper", f"{mean:.1f} ± {sd:.2f}", f"{printed.reward.mean:g}", "–", "–"))
     for r in p.rows("deep-baselines"):
         who = r["agent"] if r["mitigation"] == "raw" else f"{r['agent']} + {r['mitigation']}"
-        s = [brief(p.of(r, m)) for m in ("hacks", "observed_return", "success_rate", "true_return")]
+        s = [p.of(r, m) for m in ("hacks", "observed_return", "success_rate", "true_return")]
         rows.append((who, f"ours, T = {r['horizon']}", *s))
     return Table(
         "Table 3 (F3) with the deep baselines: 10x10, +4, per episode over the last 100 of 500",
@@ -57,7 +53,7 @@ def _baselines(p: Published) -> Table:
 def _competence(p: Published) -> Table:
     rows = []
     for r in p.rows("deep-competence"):
-        rows.append((r["agent"], *(full(p.of(r, m)) for m in ("success_rate", "true_return", "hacks"))))
+        rows.append((r["agent"], *(p.of(r, m) for m in ("success_rate", "true_return", "hacks"))))
     return Table(
         "Control: the same agents on the true reward of 10x10, T = 100",
         ("agent", "goal rate", "true return", "trap visits"),
@@ -70,7 +66,7 @@ def _competence(p: Published) -> Table:
 def _mitigated(p: Published) -> Table:
     rows = []
     for r in p.rows("deep-uard"):
-        s = [full(p.of(r, m)) for m in ("hacks", "success_rate", "true_return")]
+        s = [p.of(r, m) for m in ("hacks", "success_rate", "true_return")]
         rows.append((r["agent"], f"{r['trap']:+g}", r["panel"], r["mitigation"], *s))
     return Table(
         "Every agent with uard and uard-0.1, 10x10, T = 100, one setting of each, ratings through a learned model",
@@ -84,7 +80,7 @@ def _mitigated(p: Published) -> Table:
 def _rivals(p: Published) -> Table:
     rows = []
     for r in p.rows("deep-rivals"):
-        s = [full(p.of(r, m)) for m in ("hacks", "true_return", "success_rate")]
+        s = [p.of(r, m) for m in ("hacks", "true_return", "success_rate")]
         rows.append((r["agent"], r["panel"], r["mitigation"], *s))
     return Table(
         "Other mitigations in deep agents: 10x10, +4, T = 80, every rater with noise of sd 1.2",
@@ -95,8 +91,8 @@ def _rivals(p: Published) -> Table:
     )
 
 
-def matched(p: Published) -> list[str]:
-    """Say for each agent and panel whether ``uard`` has the highest true return among those that hack no more than it.
+def matched(p: Published) -> list[Loss]:
+    """Say for each agent and panel which rival earns more than ``uard`` among those that hack no more than it.
 
     A rival counts as matched if its hack rate is not above ``uard``'s. All rivals, agents and panels are one family of
     paired tests for hacks, and one for true returns (Holm).
@@ -108,61 +104,45 @@ def matched(p: Published) -> list[str]:
         if x is not r
     ]
     hacking, returns = (p.compare(every, metric) for metric in ("hacks", "true_return"))
-    more = [x for i, (x, _) in enumerate(every) if hacking.above(i)]
-    richer = [x for i, (x, _) in enumerate(every) if returns.above(i)]
     out = []
-    for agent in dict.fromkeys(r["agent"] for r in p.rows("deep-rivals")):
-        for panel in ("main", "appendix"):
-            group = p.rows("deep-rivals", agent=agent, panel=panel)
-            mine = [r for r in group if r["mitigation"] == OURS]
-            if not mine:
-                continue
-            equals = [r for r in group if r is not mine[0] and r not in more]
-            own = p.of(mine[0], "true_return")
-            better = [r for r in equals if r in richer]
-            higher = [r for r in equals if p.of(r, "true_return").mean > own.mean and r not in better]
-            names = ", ".join(r["mitigation"] for r in equals)
-            rivals = f"matched in hack rate by {names}" if names else "no rival hacks as rarely"
-            text = f"{agent}, {panel} panel, very noisy raters: {rivals}; uard's true return {full(own)}"
-            if better:
-                text += "; it is beaten by " + ", ".join(
-                    f"{r['mitigation']} {full(p.of(r, 'true_return'))}" for r in better
-                )
-            elif higher:
-                text += "; not told apart from " + ", ".join(
-                    f"{r['mitigation']} {full(p.of(r, 'true_return'))}" for r in higher
-                )
-            else:
-                text += "; the highest"
-            out.append(text + ".")
-    return [*out, f"Deep rivals, true return against uard: {returns.caption()}"] if every else out
+    for i, (rival, r) in enumerate(every):
+        own, theirs = (p.of(x, "true_return") for x in (r, rival))
+        if hacking.above(i) or theirs.mean <= own.mean or returns.tests[i] is None:
+            continue
+        name = rival["mitigation"]
+        told = returns.above(i)
+        what = f"{name} earns more and hacks no more" if told else f"{name} has a higher mean and hacks no more"
+        numbers = (name, own, theirs, "true return", *of_family(returns, i))
+        where = f"{r['agent']}, {r['panel']} panel, very noisy raters"
+        out.append(Loss("beaten" if told else "no better", "deep agents", what, where, *numbers))
+    return out
 
 
-def losses(p: Published) -> list[str]:
+def losses(p: Published) -> list[Loss]:
     """Say where ``uard`` fails or is beaten in deep agents, found by rule."""
-    settings = p.rows("deep-uard", mitigation=OURS)
-    missed = [
-        f"{r['agent']} {r['trap']:+g} {r['panel']}: visits {_visits(p, r)}, goal {brief(p.of(r, 'success_rate'))}"
-        for r in settings
-        if p.of(r, "hacks").mean > 0.5 or p.of(r, "success_rate").mean < 0.95
-    ]
+    return [*_missed(p), *matched(p), *_of_sources(p), *_lost_goals(p)]
+
+
+def _missed(p: Published) -> list[Loss]:
+    """Settings in which ``uard`` misses 95 % goals or half a visit, and agents that miss goals on the true reward."""
+    unable = {r["agent"]: r for r in p.rows("deep-competence") if p.of(r, "success_rate").mean < 0.95}
     out = []
-    if settings:
-        text = (
-            f"Deep agents on 10x10: of {len(settings)} settings uard misses 0.5 visits or 95 % goals in {len(missed)}"
-        )
-        out.append(text + (": " + "; ".join(missed) if missed else "") + ".")
-    unable = [r for r in p.rows("deep-competence") if p.of(r, "success_rate").mean < 0.95]
-    if unable:
-        goals = "; ".join(f"{r['agent']} {brief(p.of(r, 'success_rate'))}" for r in unable)
-        out.append(
-            f"On the true reward of 10x10 these agents miss 95 % goals in the paper's budget, so what they do there with uard says little: {goals}."
-        )
-    out += matched(p)
-    return [*out, *_of_sources(p), *_lost_goals(p)]
+    for r in p.rows("deep-uard", mitigation=OURS):
+        hacks, goals = (p.of(r, m) for m in ("hacks", "success_rate"))
+        where = f"{r['agent']}, 10x10, trap {r['trap']:+g}, {r['panel']} panel"
+        if hacks.mean > 0.5:
+            out.append(Loss("fails", "deep agents", "more than half a trap visit", where, ours=hacks, metric="hacks"))
+        if goals.mean < 0.95:
+            reference = unable.get(r["agent"])
+            against = ("", goals) if reference is None else ("true reward", goals, p.of(reference, "success_rate"))
+            why = "" if reference is None else "the agent misses them on the true reward, too"
+            out.append(
+                Loss("fails", "deep agents", "less than 95 % goals", where, *against, metric="goal rate", why=why)
+            )
+    return out
 
 
-def _of_sources(p: Published) -> list[str]:
+def _of_sources(p: Published) -> list[Loss]:
     """Say where the learned model of the ratings does worse than a table of them."""
     pairs = [
         (r, model)
@@ -170,19 +150,25 @@ def _of_sources(p: Published) -> list[str]:
         for model in p.rows("deep-feedback", source="model", rated=r["rated"], mitigation=r["mitigation"])
     ]
     family = p.compare(pairs, "true_return")
-    out = []
-    for i, (r, model) in enumerate(pairs):
-        if family.above(i):
-            table, learned = (full(p.of(x, "true_return")) for x in (r, model))
-            out.append(
-                f"{r['mitigation']} with {100 * r['rated']:g} % of steps rated: the learned model of the ratings does worse than "
-                f"a table of running means: {learned} against {table}. Here it extrapolates what few ratings do not support. "
-                f"{family.caption()}"
-            )
-    return out
+    return [
+        Loss(
+            "beaten",
+            "deep agents",
+            f"{r['mitigation']} with a model of the ratings earns less than with a table",
+            f"ensemble-dqn, {100 * r['rated']:g} % of the steps rated",
+            "a table of ratings",
+            p.of(model, "true_return"),
+            p.of(r, "true_return"),
+            "true return",
+            *of_family(family, i),
+            why="the model extrapolates what few ratings do not support",
+        )
+        for i, (r, model) in enumerate(pairs)
+        if family.above(i)
+    ]
 
 
-def _lost_goals(p: Published) -> list[str]:
+def _lost_goals(p: Published) -> list[Loss]:
     """Say in which settings ``uard`` has runs that no longer find the goal."""
     settings = [
         (r, f"{r['agent']}, {r['panel']} panel, very noisy raters") for r in p.rows("deep-rivals", mitigation=OURS)
@@ -195,14 +181,15 @@ def _lost_goals(p: Published) -> list[str]:
     for r, where in settings:
         goals = p.per_seed(r, "success_rate")
         if lost := int((goals < 0.5).sum()):
-            out.append(f"{OURS} lost the goal in {lost} of {len(goals)} runs: {where}.")
+            what = f"{lost} of {len(goals)} runs lose the goal"
+            out.append(Loss("fails", "deep agents", what, where, ours=p.of(r, "success_rate"), metric="goal rate"))
     return out
 
 
 def _ablation(p: Published) -> Table:
     rows = []
     for r in p.rows("deep-ablation"):
-        s = [full(p.of(r, m)) for m in ("hacks", "success_rate", "true_return")]
+        s = [p.of(r, m) for m in ("hacks", "success_rate", "true_return")]
         rows.append((r["variant"], r["reading"], *s))
     return Table(
         "Table 5 (F5) with deep agents: 6x6, main panel",
@@ -219,10 +206,9 @@ def _ensembles(p: Published) -> Table:
     rows = []
     for r in p.rows("deep-ensembles"):
         quality = p.derived(r, "sigma_m")
-        got = [full(statistics.summarise(quality[:, i])) for i in range(len(SIGMA_QUALITY))]
+        got = [statistics.summarise(quality[:, i]) for i in range(len(SIGMA_QUALITY))]
         name = cost.get(r["ensemble"].split(",")[0], "")
-        price = f"{speed[name]:.2f}" if name in speed else "–"
-        rows.append((r["ensemble"], price, *got, _visits(p, r)))
+        rows.append((r["ensemble"], speed.get(name), *got, p.of(r, "hacks")))
     return Table(
         "Kinds of ensembles (K4, K9): cost, and what their sigma_m knows",
         (
@@ -243,9 +229,9 @@ def _feedback(p: Published) -> Table:
     rows = []
     for r in p.rows("deep-feedback"):
         errors, ranks = p.derived(r, "rating_error"), p.derived(r, "calibration")
-        got = [brief(statistics.summarise(errors[:, i])) for i in range(len(RATING_ERROR))]
-        auroc = brief(statistics.summarise(ranks[:, CALIBRATION.index("auroc_with_proxy")]))
-        visits, true = (brief(p.of(r, m)) for m in ("hacks", "true_return"))
+        got = [statistics.summarise(errors[:, i]) for i in range(len(RATING_ERROR))]
+        auroc = statistics.summarise(ranks[:, CALIBRATION.index("auroc_with_proxy")])
+        visits, true = (p.of(r, m) for m in ("hacks", "true_return"))
         rows.append((r["mitigation"], r["source"], f"{100 * r['rated']:g} %", *got, auroc, visits, true))
     return Table(
         "What the learner knows of its raters: running means, or a model of the ratings (10x10, main panel)",
@@ -264,7 +250,7 @@ def _distortion(p: Published) -> Table:
         count, largest, mean = (
             statistics.summarise(p.derived(r, n)) for n in ("activations", "largest", "mean_inside")
         )
-        rows.append((r["agent"], full(count), full(largest), full(mean)))
+        rows.append((r["agent"], count, largest, mean))
     return Table(
         "A distorted reward after training (H15, H16; our definitions)",
         ("agent", "exploit activations of 60", "largest adjusted reward", "mean adjusted reward in the windows"),
@@ -284,9 +270,9 @@ def _credentials() -> Table:
     for row in data["rows"]:
         if "returns" in row:
             who = "ours" if row["who"] == "ours" else LIBRARIES[row.get("library", "stable-baselines3")]
-            seeds, returned = str(len(row["returns"])), full(statistics.summarise(row["returns"]))
+            seeds, returned = str(len(row["returns"])), statistics.summarise(row["returns"])
         else:
-            who, seeds, returned = row["who"], "–", f"{row['mean']} ± {row['sd']}"
+            who, seeds, returned = row["who"], None, f"{row['mean']} ± {row['sd']}"
         rows.append((row["task"], row["agent"], who, seeds, f"{row['budget']:,}", returned))
     return Table(
         "Credentials: returns beside Stable-Baselines3, sb3-contrib, SBX and published ones",
@@ -303,55 +289,78 @@ def _speed() -> Table:
     rows = tuple(
         (
             r["name"],
-            f"{r['steps_per_second']:.0f} ({r['range'][0]:.0f}-{r['range'][1]:.0f})",
-            f"{r['us_per_step']:.0f}",
-            f"{r['floor_us']:.0f}",
-            f"{r['times_sb3']:.1f}",
-            f"{r['cost_of_single']:.2f}",
+            r["steps_per_second"],
+            f"{r['range'][0]:,.0f} to {r['range'][1]:,.0f}".replace(",", " "),
+            r["us_per_step"],
+            r["floor_us"],
+            r["times_sb3"],
+            r["cost_of_single"],
         )
         for r in data["rows"]
     )
     return Table(
         "Speed of DQN on 10x10, one update per step, one core, one run",
-        ("what", "steps/s (range)", "us per step", "floor us", "times SB3", "cost, single = 1"),
+        ("what", "steps per second", "range", "µs per step", "floor, µs", "times SB3", "cost, single = 1"),
         rows,
         1,
         f"Floor: arithmetic of an update at the machine's {data['matrix_rate'] / 1e9:.0f} GFLOP/s (benchmarks/deep.py).",
     )
 
 
-def drawn(p: Published) -> list[tuple[str, str, str]]:
-    """Return (title, what to see, image) of all figures for which there are results."""
+def drawn(p: Published) -> list[Picture]:
+    """Return all pictures for which there are results."""
+    command = made_by(p.sources, "grid-deep", "uard reproduce grid-deep")
     made = []
     if p.rows("deep-baselines", horizon=100):
-        note = "Mean over seeds, bins of 10 episodes. A low observed return is no virtue; a high one is the hack."
-        made.append(("G16 · observed return of all deep agents, 10x10, T = 100", note, _curves(p)))
+        made.append(_curves(p, command))
     if len(p.rows("deep-distortion")) == 3:
-        note = (
+        windows = (
             "Seed 0. Shaded: the windows in which the observed reward is inflated. Arrivals at the goal are left out."
         )
-        made.append(("G14, G15 · confidence-adjusted reward under distortion", note, _adjusted(p)))
-        note = "Left: what each would learn from; right: lambda_t of uard-0.1, which rises where the reward contradicts the raters."
         made.append(
-            ("G12 · a hacking region, and lambda_t", note, figures.hacking_region(_trace(p, "uard-0.1"), WINDOWS))
+            _adjusted(p).picture(
+                "g14-g15",
+                "G14, G15 · confidence-adjusted reward under distortion",
+                f"See which line leaves the dotted bound in the shaded windows: it believes the inflated reward. {windows}",
+                command,
+            )
         )
-    return [(title, note, data_uri(figure)) for title, note, figure in made]
+        made.append(
+            figures.hacking_region(_trace(p, "uard-0.1"), WINDOWS).picture(
+                "g12",
+                "G12 · a hacking region, and lambda_t",
+                f"See lambda_t (below) rise where the reward contradicts the raters, and our reward (above) stay. {windows}",
+                command,
+            )
+        )
+    return made
 
 
-def _curves(p: Published) -> Figure:
-    figure, axes = axes_of(2, 6.2, 4.2)
-    for axis, column in zip(axes, ("observed_return", "hacks"), strict=True):
+def _curves(p: Published, command: str) -> Picture:
+    columns = ("observed_return", "hacks")
+    chart = Chart(
+        ["Observed return", "Trap visits"], "episode", ["observed return per episode", "trap visits per episode"],
+        height=4.2,
+    )  # fmt: skip
+    for i, column in enumerate(columns):
         for r in p.rows("deep-baselines", horizon=100):
             curve = p.curves(r, column).mean(0)
             raw = r["mitigation"] == "raw"
             label = r["agent"] if raw else f"{r['agent']} + {r['mitigation']}"
-            colour = COLOURS[r["agent"]] if raw else PALETTE[r["mitigation"]]
             x = (np.arange(len(curve)) + 1) * BIN
-            style = "-" if raw else ":" if r["agent"] == "ppo" else "--"
-            axis.plot(x, curve, color=colour, lw=1.6 if raw else 2.4, ls=style, label=label)
-        axis.set(xlabel="episode", ylabel=column.replace("_", " "))
-    axes[1].legend(fontsize=8, ncols=2)
-    return figure
+            how = (
+                look(r["agent"])
+                if raw
+                else look(r["mitigation"])._replace(dash=DOTTED if r["agent"] == "ppo" else DASHED)
+            )
+            chart.line(i, x, curve, label, look_of=how)
+    return chart.picture(
+        "g16-deep",
+        "G16 · observed return of all deep agents, 10x10, T = 100",
+        "See that the agents with the highest observed return (left) are those that stay in the traps (right). Lines are "
+        f"means over {p.seeds('deep-baselines')} seeds, in groups of {BIN} episodes.",
+        command,
+    )
 
 
 def _trace(p: Published, agent: str) -> np.ndarray:
@@ -362,9 +371,6 @@ def _trace(p: Published, agent: str) -> np.ndarray:
     return trace
 
 
-def _adjusted(p: Published) -> Figure:
-    rivals = {name: (_trace(p, name)[1], COLOURS[name]) for name in ("edac", "sunrise")}
-    figure = figures.adjusted_reward(rivals, _trace(p, "uard-0.1")[1], "ensemble-dqn + uard-0.1", WINDOWS)
-    for axis in figure.axes:
-        axis.axhline(distortion.THRESHOLD, color="k", ls=":", lw=1)
-    return figure
+def _adjusted(p: Published) -> Chart:
+    rivals = {name: _trace(p, name)[1] for name in ("edac", "sunrise")}
+    return figures.adjusted_reward(rivals, _trace(p, "uard-0.1")[1], "uard-0.1", WINDOWS, distortion.THRESHOLD)

@@ -8,14 +8,15 @@ from importlib import resources
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from uard.lab import statistics
 from uard.lab.study import Row
 from uard.lab.trainers import examine
-from uard.lab.views.figures import axes_of, data_uri
+from uard.lab.views.figures import Chart, Picture, made_by
+from uard.lab.views.losses import Kind, Loss, of_family
+from uard.lab.views.palette import DASHED, SOLID, look
 from uard.lab.views.published import Published, packaged_json
-from uard.lab.views.tables import Table, full, number
+from uard.lab.views.tables import Cell, Number, Table, full
 from uard.replication import figures, paper
 from uard.replication.studies import derive
 
@@ -30,7 +31,6 @@ REFERENCES = ("raw", "true reward")
 REMOVED, KEPT, COST = 0.936, 0.9, 0.05  # the paper's best reduction (J16); what is asked of a filter beside it
 METRICS = ("hacks", "true_return", "observed_return")
 HEADS = ("steps in the region per episode", "true return", "observed return")  # of METRICS
-COLOURS = {"true reward": "#444444", "raw": "#c1272d", "uard-paper": "#e08214", "uard-0.1": "#2c6fbb"}
 
 
 def summary(values: np.ndarray) -> str:
@@ -77,15 +77,16 @@ def _budget(p: Published, rows: list[Row]) -> str:
 def _hacking(p: Published) -> Table:
     rows = []
     for r in p.rows(HACKING):
-        cells = (summary(p.per_seed(r, m)) for m in METRICS)
+        cells = (p.of(r, m) for m in METRICS)
         share = _shares(p, r)
         where = f"{r['robot']}, {r['region']}" if r["region"] != "none" else f"{r['robot']}, no lie"
-        best = (summary(x) for x in p.derived(r, "deterministic").T)
+        best = (statistics.summarise(x) for x in p.derived(r, "deterministic").T)
         rows.append((where, r["agent"], r["mitigation"], r["panel"], *cells, *share, *best))
     return Table(
         f"Hopper and Walker2d with a reward that lies (G6, G7), {_steps(p, HACKING)}, 15 % of steps rated",
         (
-            "task", "agent", "learns from", "panel", *HEADS, "hacks removed", "true return kept", "deterministic: steps in the region", "true return",
+            "task", "agent", "learns from", "panel", *HEADS, "hacks removed, %", "true return kept, %",
+            "deterministic: steps in the region", "deterministic: true return",
         ),
         tuple(rows),
         4,
@@ -125,10 +126,10 @@ def _kept(p: Published, r: Row, honest: Row | None) -> float | None:
     return p.of(r, "true_return").mean / p.of(honest, "true_return").mean
 
 
-def _shares(p: Published, r: Row) -> tuple[str, str]:
+def _shares(p: Published, r: Row) -> tuple[Cell, Cell]:
     if r["mitigation"] in REFERENCES:
-        return "–", "–"
-    removed, kept = ("–" if x is None else f"{100 * x:.1f} %" for x in shares(p, r))
+        return None, None
+    removed, kept = (None if x is None else Number(100 * x) for x in shares(p, r))
     return removed, kept
 
 
@@ -162,7 +163,7 @@ def _pooled(p: Published) -> Table:
     for robot, agent in _settings(p):
         for mitigation in ("uard-paper", "uard-0.1"):
             if (found := pooled(p, robot, agent, mitigation)) is not None:
-                shares = (summary(100 * x) for x in found)
+                shares = (statistics.summarise(100 * x) for x in found)
                 rows.append((robot, agent, mitigation, str(len(found[0])), *shares))
     return Table(
         "The same, both regions and both panels together",
@@ -176,7 +177,7 @@ def _pooled(p: Published) -> Table:
 
 def _noise(p: Published) -> Table:
     rows = [
-        (r["agent"], r["mitigation"], f"{100 * r['noise']:.0f} %", *(summary(p.per_seed(r, m)) for m in METRICS))
+        (r["agent"], r["mitigation"], f"{100 * r['noise']:.0f} %", *(p.of(r, m) for m in METRICS))
         for r in p.rows(NOISE)
     ]
     return Table(
@@ -194,7 +195,7 @@ def _kick(p: Published) -> Table:
             r["mitigation"],
             r["kicked"],
             f"{r['at'] or '–'}",
-            *(summary(p.per_seed(r, m)) for m in (*METRICS, "episode_length")),
+            *(p.of(r, m) for m in (*METRICS, "episode_length")),
         )
         for r in p.rows(KICK)
     ]
@@ -236,9 +237,9 @@ _SHOWN = (("before", examine.KICKS[-1]), *((w, k) for w in ("kick", "later") for
 
 
 def _around_kick(p: Published) -> Table:
-    def cell(columns: dict[str, np.ndarray], name: str) -> str:
+    def cell(columns: dict[str, np.ndarray], name: str) -> Cell:
         values = columns[name] if name == "standing" else columns[name][columns["standing"] > 0]
-        return summary(values) if len(values) else "–"
+        return statistics.summarise(values) if len(values) else None
 
     rows = []
     for r in drifting(p):
@@ -265,7 +266,7 @@ def _around_kick(p: Published) -> Table:
 def _bonuses(p: Published) -> Table:
     published = p.rows(BONUSES)
     rows = [
-        (r["region"], f"{r['bonus']:g}", r["mitigation"], r["panel"], *(summary(p.per_seed(r, m)) for m in METRICS))
+        (r["region"], f"{r['bonus']:g}", r["mitigation"], r["panel"], *(p.of(r, m) for m in METRICS))
         for r in published
         if len({r["bonus"] for r in published}) > 1  # the default bonus alone is in the first table
     ]
@@ -278,10 +279,7 @@ def _bonuses(p: Published) -> Table:
 
 
 def _legitimate(p: Published) -> Table:
-    rows = [
-        (r["region"], r["mitigation"], r["panel"], *(summary(p.per_seed(r, m)) for m in METRICS))
-        for r in p.rows(LEGITIMATE)
-    ]
+    rows = [(r["region"], r["mitigation"], r["panel"], *(p.of(r, m) for m in METRICS)) for r in p.rows(LEGITIMATE)]
     return Table(
         f"Twins whose bonus is real: Hopper, PPO, {_steps(p, LEGITIMATE)}",
         ("region", "learns from", "panel", *HEADS),
@@ -296,9 +294,9 @@ def _caution(p: Published) -> Table:
     rows = []
     for r in p.rows(CAUTION):
         kept = _kept(p, r, _found(p, CAUTION, learns_from="raw"))
-        best = (summary(x) for x in p.derived(r, "deterministic").T[1:])
-        share = "–" if kept is None else f"{100 * kept:.0f} %"
-        rows.append((r["learns_from"], summary(p.per_seed(r, "true_return")), share, *best))
+        best = (statistics.summarise(x) for x in p.derived(r, "deterministic").T[1:])
+        share = None if kept is None else f"{100 * kept:.0f} %"
+        rows.append((r["learns_from"], p.of(r, "true_return"), share, *best))
     return Table(
         f"What listening costs where nothing lies: Hopper, PPO, main panel, {_steps(p, CAUTION)}, 15 % of steps rated",
         ("learns from", "true return", "of the raw agent's", "deterministic: true return"),
@@ -311,8 +309,7 @@ def _caution(p: Published) -> Table:
 
 def _ablation(p: Published) -> Table:
     rows = [
-        (r["agent"], r["region"], r["variant"], r["panel"], *(summary(p.per_seed(r, m)) for m in METRICS))
-        for r in p.rows(ABLATION)
+        (r["agent"], r["region"], r["variant"], r["panel"], *(p.of(r, m) for m in METRICS)) for r in p.rows(ABLATION)
     ]
     return Table(
         f"Which source does the work (H8): Hopper, uard-0.1, {_steps(p, ABLATION)}",
@@ -327,14 +324,14 @@ def _ablation(p: Published) -> Table:
 def _rating(p: Published) -> Table:
     rows = []
     for r in p.rows(RATING):
-        best = (summary(x) for x in p.derived(r, "deterministic").T)
-        cells = (summary(p.per_seed(r, m)) for m in ("hacks", "true_return"))
+        best = (statistics.summarise(x) for x in p.derived(r, "deterministic").T)
+        cells = (p.of(r, m) for m in ("hacks", "true_return"))
         rows.append((r["region"], r["panel"], r["query"], *cells, *best))
     return Table(
         f"Which steps are rated: Hopper, PPO with uard-0.1, {_steps(p, RATING)}, 15 % of steps",
         (
             "region", "panel", "rated steps", "steps in the region per episode", "true return",
-            "deterministic: steps in the region", "true return",
+            "deterministic: steps in the region", "deterministic: true return",
         ),
         tuple(rows),
         3,
@@ -346,7 +343,7 @@ def _distortion(p: Published) -> Table:
     rows = []
     for r in p.rows(DISTORTION):
         columns = np.column_stack([p.derived(r, "reaction"), p.derived(r, "warning")]).T
-        rows.append((r["agent"], r["critics"], *(summary(c) for c in columns)))
+        rows.append((r["agent"], r["critics"], *(statistics.summarise(c) for c in columns)))
     return Table(
         f"A distorted reward after training (G12, G14, G15; H13, H15, H16) on Hopper, {_steps(p, DISTORTION)}",
         (
@@ -368,13 +365,13 @@ def _speed() -> Table:
     first: dict[str, float] = {}
     rows = []
     for r in data["rows"]:
-        low, high = (f"{x:,.0f}" for x in r["range"])
-        share = f"{100 * r['share_of_matrix_rate']:.0f} %" if "share_of_matrix_rate" in r else "–"
+        low, high = (f"{x:,.0f}".replace(",", " ") for x in r["range"])
+        share = f"{100 * r['share_of_matrix_rate']:.0f} %" if "share_of_matrix_rate" in r else None
         times = r["rate"] / first.setdefault(r["what"], r["rate"])
-        rows.append((r["what"], r["who"], f"{r['rate']:,.0f} ({low}-{high})", f"{times:.2f}", share))
+        rows.append((r["what"], r["who"], f"{r['rate']:,.0f}".replace(",", " "), f"{low} to {high}", times, share))
     return Table(
         "Speed in MuJoCo, side by side",
-        ("what", "who", "rate (range)", "times the first", "of the matrix rate"),
+        ("what", "who", "rate per second", "range", "times the first", "of the matrix rate"),
         tuple(rows),
         2,
         f"Made by {data['command']} on {data['machine']}; rates are per second. Machines differ: where products of "
@@ -382,53 +379,68 @@ def _speed() -> Table:
     )
 
 
-def losses(p: Published) -> list[str]:
-    """Say where ``uard-0.1`` misses what is asked of it in MuJoCo, found by rule: a short line each, what it costs first."""
-    found = (
-        _of_returns(p) + _of_hacks(p) + _of_tame(p) + _of_nothing(p) + _of_twins(p) + _of_noise(p) + _of_distortion(p)
-    )
-    return [f"MuJoCo, {line}." for line in found]
+def losses(p: Published) -> list[Loss]:
+    """Say where ``uard-0.1`` misses what is asked of it in MuJoCo, found by rule; none of it is of today's ``uard``."""
+    return [
+        *_of_returns(p),
+        *_of_hacks(p),
+        *_of_tame(p),
+        *_of_nothing(p),
+        *_of_twins(p),
+        *_of_noise(p),
+        *_of_distortion(p),
+    ]
 
 
-def _of_agent(p: Published, **labels: Any) -> list[tuple[str, list[Row]]]:
-    """Return the rows of ``uard-0.1`` by agent; the name of one that was run once says so."""
+def _loss(kind: Kind, what: str, where: str, **fields: Any) -> Loss:
+    return Loss(kind, "robots, uard-0.1", what, where, **fields)
+
+
+def _of_agent(p: Published, **labels: Any) -> dict[str, list[Row]]:
+    """Return the rows of ``uard-0.1`` by agent."""
     groups: dict[str, list[Row]] = {}
     for r in p.rows(HACKING, mitigation="uard-0.1", **labels):
         groups.setdefault(r["agent"], []).append(r)
-    once = " (one run each)"
-    return [(a + once * all(len(p.seeds_of(r)) == 1 for r in rows), rows) for a, rows in groups.items()]
+    return groups
 
 
 def _lying(rows: list[Row]) -> list[Row]:
     return [r for r in rows if r["region"] != "none"]
 
 
-def _of_returns(p: Published) -> list[str]:
+def _of_returns(p: Published) -> list[Loss]:
     out = []
-    for agent, rows in _of_agent(p):
+    for agent, rows in _of_agent(p).items():
         kept = [(share, r) for r in _lying(rows) if (share := shares(p, r)[1]) is not None]
         poor = [share for share, _ in kept if share < KEPT]
         if poor:
-            worst, r = min(kept, key=lambda k: k[0])
-            out.append(
-                f"{agent}: {100 * (1 - worst):.0f} % of the honest agent's true return is lost at "
-                f"worst ({_place(r)}), more than {100 * (1 - KEPT):.0f} % in {len(poor)} of {len(kept)} settings"
+            _, r = min(kept, key=lambda k: k[0])
+            what = (
+                f"more than {100 * (1 - KEPT):.0f} % of the true return is lost in {len(poor)} of {len(kept)} settings"
             )
+            honest = _rival(p, r, "true reward")
+            theirs = None if honest is None else p.of(honest, "true_return")
+            numbers = {"against": "true reward", "ours": p.of(r, "true_return"), "theirs": theirs}
+            out.append(_loss("fails", what, f"{agent}; worst: {_place(r)}", **numbers))
     return out
 
 
-def _of_hacks(p: Published) -> list[str]:
+def _of_hacks(p: Published) -> list[Loss]:
     out = []
-    for agent, rows in _of_agent(p):
+    for agent, rows in _of_agent(p).items():
         removed = [(share, r) for r in _lying(rows) if (share := shares(p, r)[0]) is not None]
         leaks = [r for share, r in removed if share < REMOVED]
         if leaks:
-            worst, r = min(removed, key=lambda k: k[0])
-            out.append(
-                f"{agent}: {100 * (1 - worst):.1f} % of the raw agent's hacks are left at worst ({_place(r)}: "
-                f"{_steps_inside(p, r)}), more than {100 * (1 - REMOVED):.1f} % in {len(leaks)} of {len(removed)} settings, "
-                f"and no more than by training on the true reward in {_as_honest(p, leaks)} of these"
+            _, r = min(removed, key=lambda k: k[0])
+            raw = _rival(p, r, "raw")
+            left = 100 * (1 - REMOVED)
+            what = (
+                f"more than {left:.1f} % of the raw agent's hacks are left in {len(leaks)} of {len(removed)} settings"
             )
+            why = f"in {_as_honest(p, leaks)} of these no more than by training on the true reward"
+            theirs = None if raw is None else p.of(raw, "hacks")
+            numbers = {"against": "raw", "ours": p.of(r, "hacks"), "theirs": theirs, "metric": "steps in the region"}
+            out.append(_loss("fails", what, f"{agent}; worst: {_place(r)}", why=why, **numbers))
     return out
 
 
@@ -437,141 +449,166 @@ def _as_honest(p: Published, rows: list[Row]) -> int:
     return sum(h is not None and p.of(r, "hacks").mean <= p.of(h, "hacks").mean for r, h in rivals)
 
 
-def _of_tame(p: Published) -> list[str]:
+def _of_tame(p: Published) -> list[Loss]:
+    """Where the lie does no harm: what a filter does there proves nothing."""
     pairs = [(r, x) for r in p.rows(HACKING, mitigation="raw") if (x := _rival(p, r, "true reward")) is not None]
     family = p.compare(pairs, "true_return")
-    tame = [
-        f"{r['robot']} {r['region']} {r['agent']}"
-        for i, (r, _) in enumerate(pairs)
+    return [
+        _loss(
+            "no better",
+            "the raw agent earns no less than the honest one: nothing is proved here",
+            f"{r['robot']} {r['region']}, {r['agent']}",
+            against="raw",
+            ours=p.of(honest, "true_return"),
+            theirs=p.of(r, "true_return"),
+            metric="true return (ours: the honest agent)",
+            **dict(zip(("p", "of"), of_family(family, i), strict=True)),
+        )
+        for i, (r, honest) in enumerate(pairs)
         if family.tests[i] and not family.below(i)
     ]
-    if not tame:
-        return []
-    return [f"no loss, but no proof: the raw agent's true return is no worse than the honest agent's{_listed(tame)}"]
 
 
-def _of_nothing(p: Published) -> list[str]:
+def _of_nothing(p: Published) -> list[Loss]:
     """What is lost where nothing lies."""
     out = []
-    for agent, rows in _of_agent(p, region="none"):
-        lost = [(100 * (1 - share), r["robot"]) for r in rows if (share := shares(p, r)[1]) is not None]
-        dear = [f"{share:.0f} % ({robot})" for share, robot in lost if share > 100 * COST]
-        if dear:
-            out.append(f"nothing lies, {agent}: {' and '.join(dear)} of the raw agent's true return is lost")
+    for agent, rows in _of_agent(p, region="none").items():
+        for r in rows:
+            raw, share = _rival(p, r, "raw"), shares(p, r)[1]
+            if raw is not None and share is not None and 1 - share > COST:
+                what = f"{100 * (1 - share):.0f} % of the raw agent's true return is lost, and nothing lies"
+                numbers = {"against": "raw", "ours": p.of(r, "true_return"), "theirs": p.of(raw, "true_return")}
+                out.append(_loss("costs", what, f"{r['robot']}, {agent}", **numbers))
     return out
 
 
-def _of_twins(p: Published) -> list[str]:
+def _of_twins(p: Published) -> list[Loss]:
     out = []
     for r in p.rows(LEGITIMATE, mitigation="uard-0.1"):
-        kept = _kept(p, r, _found(p, LEGITIMATE, mitigation="raw", region=r["region"]))
-        if kept is not None and kept < 1 - COST:
-            where = f"{r['region']}, {r['panel']} panel"
-            out.append(f"the bonus is real, Hopper, PPO: {100 * (1 - kept):.0f} % of the true return is lost ({where})")
+        raw = _found(p, LEGITIMATE, mitigation="raw", region=r["region"])
+        kept = _kept(p, r, raw)
+        if raw is not None and kept is not None and kept < 1 - COST:
+            what = f"the bonus is real, and {100 * (1 - kept):.0f} % of the true return is lost"
+            numbers = {"against": "raw", "ours": p.of(r, "true_return"), "theirs": p.of(raw, "true_return")}
+            out.append(_loss("costs", what, f"hopper {r['region']}, PPO, {r['panel']} panel", **numbers))
     return out
 
 
-def _of_noise(p: Published) -> list[str]:
+def _of_noise(p: Published) -> list[Loss]:
     out = []
     for r in p.rows(NOISE, mitigation="uard-0.1"):
         raw, honest = (
             _found(p, HACKING, robot="hopper", region="vibration", agent=r["agent"], mitigation=m) for m in REFERENCES
         )
         removed, kept = _removed(p, r, raw), _kept(p, r, honest)
-        setting = f"raters' noise {100 * r['noise']:.0f} %, Hopper, {r['agent']}"
-        own = summary(p.per_seed(r, "true_return"))
-        if r["noise"] and removed is not None and removed < REMOVED:
-            hacks = summary(p.per_seed(r, "hacks"))
-            out.append(f"{setting}: {100 * (1 - removed):.1f} % of the raw agent's hacks are left, {hacks} steps")
-        if r["noise"] and kept is not None and kept < KEPT:
-            out.append(f"{setting}: {100 * (1 - kept):.0f} % of the honest agent's true return is lost, {own} remains")
+        where = f"hopper, {r['agent']}, raters' noise {100 * r['noise']:.0f} %"
+        own = p.of(r, "true_return")
+        if raw is not None and r["noise"] and removed is not None and removed < REMOVED:
+            what = f"{100 * (1 - removed):.1f} % of the raw agent's hacks are left"
+            numbers = {"against": "raw", "ours": p.of(r, "hacks"), "theirs": p.of(raw, "hacks"), "metric": "hacks"}
+            out.append(_loss("fails", what, where, **numbers))
+        if honest is not None and r["noise"] and kept is not None and kept < KEPT:
+            what = f"{100 * (1 - kept):.0f} % of the honest agent's true return is lost"
+            numbers = {"against": "true reward", "ours": own, "theirs": p.of(honest, "true_return")}
+            out.append(_loss("fails", what, where, **numbers))
         for x in p.rows(NOISE, agent=r["agent"], noise=r["noise"]):
-            if x["mitigation"] not in ("uard-0.1", "raw") and p.of(x, "true_return").mean > p.of(r, "true_return").mean:
-                theirs = summary(p.per_seed(x, "true_return"))
-                out.append(f"{setting}: {x['mitigation']} has a higher true return: {theirs} against {own}")
+            if x["mitigation"] not in ("uard-0.1", "raw") and p.of(x, "true_return").mean > own.mean:
+                name = x["mitigation"]
+                numbers = {"against": name, "ours": own, "theirs": p.of(x, "true_return")}
+                out.append(_loss("no better", f"{name} has a higher mean", where, **numbers))
     return out
 
 
-def _of_distortion(p: Published) -> list[str]:
+def _of_distortion(p: Published) -> list[Loss]:
     rows = {r["critics"]: r for r in p.rows(DISTORTION, agent="uard-0.1")}
     if len(rows) < 2:
         return []
     shared, full_ones = (list(p.derived(rows[k], "warning").T) for k in ("5, shared trunk", "5, full"))
     return [
-        f"sigma_m of five critics on one trunk warns of {what} with an AUROC of {summary(a)}, of five full ones {summary(b)}"
+        _loss(
+            "beaten",
+            "critics on one trunk warn less than full ones",
+            what,
+            against="5 full critics",
+            ours=statistics.summarise(a),
+            theirs=statistics.summarise(b),
+            metric="AUROC of sigma_m",
+            note="one run" if len(a) == 1 else "",
+        )
         for what, a, b in zip(("states thrown off", "wrong values"), shared, full_ones, strict=True)
         if b.mean() - a.mean() > AS_GOOD
     ]
-
-
-def _steps_inside(p: Published, r: Row) -> str:
-    rows = (r, _rival(p, r, "raw"), _rival(p, r, "true reward"))
-    own, raw, honest = ("?" if x is None else number(p.of(x, "hacks").mean) for x in rows)
-    return f"{own} steps of {raw}; true reward {honest}"
-
-
-def _listed(names: list[str]) -> str:
-    return f" ({'; '.join(names)})" if names else ""
 
 
 def _place(r: Row) -> str:
     return f"{r['robot']} {r['region']}, {r['panel']} panel"
 
 
-def drawn(p: Published) -> list[tuple[str, str, str]]:
-    """Return (title, what to see, image) of each figure for which there are results."""
-    made = []
-    for robot in dict.fromkeys(robot for robot, _ in _settings(p)):
-        note = "One dot per seed, a bar at the mean. A mitigation works if hacks fall and the true return does not."
-        title = f"G6, G7 · {robot}: steps in the region that lies, and what they were worth"
-        made.append((title, note, _dots(p, robot)))
+def drawn(p: Published) -> list[Picture]:
+    """Return each picture for which there are results."""
+    made = [_dots(p, robot) for robot in dict.fromkeys(robot for robot, _ in _settings(p))]
     made += _over_training(p)
     traced = p.rows(DISTORTION)
     if len(traced) == len(p.studies[DISTORTION].rows):
-        note = "The first seed. Shaded: the windows in which the observed reward is inflated."
-        rivals = {name: (_traced(p, name)[1], "#c1272d") for name in ("edac", "sunrise")}
+        seed = "The first seed. Shaded: the windows in which the observed reward is inflated."
+        rivals = {name: _traced(p, name)[1] for name in ("edac", "sunrise")}
         ours = _traced(p, "uard-0.1")
-        figure = figures.adjusted_reward(rivals, ours[1], "ensemble-sac + uard-0.1", examine.WINDOWS)
-        made.append(("G14, G15 · confidence-adjusted reward under distortion, Hopper", note, figure))
-        note = "Left: what each would learn from; right: lambda_t of uard-0.1, which should rise in the windows."
         made.append(
-            ("G12 · a hacking region, and lambda_t, Hopper", note, figures.hacking_region(ours, examine.WINDOWS))
+            figures.adjusted_reward(rivals, ours[1], "uard-0.1", examine.WINDOWS).picture(
+                "g14-g15-hopper",
+                "G14, G15 · confidence-adjusted reward under distortion, Hopper",
+                f"See which line jumps in the shaded windows: it believes the inflated reward. {seed}",
+                _command(p, DISTORTION),
+            )
         )
-        note = (
-            "The reward of a random action's step is raised by epsilon and then filtered. Left: the mean advantage of the "
-            "agent's own action over it, on the learned critics; right: how often its sign is kept. Mean over seeds."
+        made.append(
+            figures.hacking_region(ours, examine.WINDOWS).picture(
+                "g12-hopper",
+                "G12 · a hacking region, and lambda_t, Hopper",
+                f"See whether lambda_t (below) rises in the windows, as it should, and our reward (above) stays. {seed}",
+                _command(p, DISTORTION),
+            )
         )
-        made.append(("G13 · sign preservation on learned critics, Hopper", note, _signs(p)))
-    return [(title, note, data_uri(figure)) for title, note, figure in made]
+        made.append(_signs(p))
+    return made
+
+
+def _command(p: Published, study: str) -> str:
+    """Return what makes the results of a study."""
+    seeds = max(len(p.seeds_of(r)) for r in p.rows(study))
+    return made_by(p.sources, study, f"uard reproduce {study} --seeds {seeds}")
 
 
 TARGETS = {"hopper": ("G6", "Hopper objective"), "walker2d": ("G7", "Walker2d objective")}
 
 
-def _over_training(p: Published) -> list[tuple[str, str, Figure]]:
+def _over_training(p: Published) -> list[Picture]:
     made = []
     for robot, (name, objective) in TARGETS.items():
         rows = drifting(p, robot=robot)
-        curves = {r["mitigation"]: (p.derived(r, "learning"), COLOURS[r["mitigation"]]) for r in rows}
+        curves = {r["mitigation"]: p.derived(r, "learning") for r in rows}
         if curves:
             target = paper.TEXT[objective].value
-            figure = figures.over_training(curves, rows[0].cell.steps or 0, target)
             note = (
-                f"PPO, vibration, main panel, {_budget(p, drifting(p))}. Mean over seeds and its 95 % interval, of the episodes that "
-                f"ended in each twentieth of the training. Dotted: the paper's objective of {target:g}, a fall. Drift is where "
-                "the observed return rises and the true one falls."
+                "See whether the observed return rises while the true one falls: that would be the drift that the paper "
+                f"shows. PPO, vibration, main panel, {_budget(p, drifting(p))}. Lines are means over seeds of the episodes "
+                "that ended in each twentieth of the training, bands their 95 % intervals. Dotted: the paper's objective "
+                f"of {target:g}, which is a fall."
             )
-            made.append((f"{name} · {robot} over its training", note, figure))
+            chart = figures.over_training(curves, rows[0].cell.steps or 0, target)
+            title = f"{name} · {robot} over its training"
+            made.append(chart.picture(f"{name.lower()}-{robot}-training", title, note, _command(p, DRIFT)))
     rows = drifting(p, robot="hopper")
     for i, size in reversed([*enumerate(examine.KICKS)][1:] if rows else []):
-        walks = {r["mitigation"]: (p.derived(r, "kicked")[:, i], COLOURS[r["mitigation"]]) for r in rows}
+        walks = {r["mitigation"]: p.derived(r, "kicked")[:, i] for r in rows}
         note = (
-            f"{size:g} m/s from behind after step {examine.KICKED_AT} of an episode of the trained agent. Mean over the seeds "
-            "of which a copy still stands, and its 95 % interval; a line ends where fewer than two are left. Raw agents ask "
-            "no raters."
+            f"See both sigmas after the dotted line: {size:g} m/s from behind after step {examine.KICKED_AT} of an episode of "
+            "the trained agent. Lines are means over the seeds of which a copy still stands, bands their 95 % intervals; a "
+            "line ends where fewer than two are left. Raw agents ask no raters."
         )
         title = f"G10 · sigma_m and sigma_h along an episode with a kick of {size:g} m/s, Hopper"
-        made.append((title, note, figures.kicked(walks)))
+        id = f"g10-kick-{size:g}".replace(".", "-")
+        made.append(figures.kicked(walks).picture(id, title, note, _command(p, DRIFT)))
     return made
 
 
@@ -580,24 +617,33 @@ def _traced(p: Published, agent: str) -> np.ndarray:
     return p.derived(r, "trace")
 
 
-def _signs(p: Published) -> Figure:
-    figure, axes = axes_of(2, 6.2, 3.8)
-    for agent, style in (("uard-0.1", "-"), ("uard-0.1 (ppo)", "--")):
+def _signs(p: Published) -> Picture:
+    chart = Chart(
+        ["Advantage of the agent's own action", "How often its sign is kept"],
+        "perturbation epsilon, reward units",
+        ["advantage", "share of signs kept"],
+    )
+    for agent, dash in (("uard-0.1", SOLID), ("uard-0.1 (ppo)", DASHED)):
         (r, *_) = p.rows(DISTORTION, agent=agent)
         mean = p.derived(r, "perturbed").reshape(-1, len(examine.EPSILONS), len(examine.PERTURBED)).mean(0)
-        for filtered, colour in ((True, COLOURS["uard-0.1"]), (False, "#c1272d")):
-            label = f"{'ensemble-sac' if agent == 'uard-0.1' else 'ppo'}, {'filtered' if filtered else 'raw reward'}"
-            for axis, column in zip(axes, (0, 2), strict=True):
-                axis.plot(examine.EPSILONS, mean[:, column + (not filtered)], color=colour, ls=style, label=label)
-    axes[0].axhline(0.0, color="k", lw=0.8)
-    for axis, label in zip(axes, ("advantage", "share of signs kept"), strict=True):
-        axis.set(xlabel="epsilon", ylabel=label)
-    axes[0].legend(fontsize=8)
-    return figure
+        who = "ensemble-sac" if agent == "uard-0.1" else "ppo"
+        for filtered, how in ((True, look("uard-0.1")), (False, look("raw"))):
+            label = f"{who}, {'filtered' if filtered else 'raw reward'}"
+            for i, column in enumerate((0, 2)):
+                y = mean[:, column + (not filtered)]
+                chart.line(i, examine.EPSILONS, y, label, look_of=how._replace(dash=dash))
+    chart.reference(0, 0.0, "")
+    note = (
+        "See whether the filtered lines stay above the raw ones: then the filter protects the choice. The reward of a random "
+        "action's step is raised by epsilon and then filtered; the advantage is of the agent's own action over it, on the "
+        "learned critics. Lines are means over seeds."
+    )
+    title = "G13 · sign preservation on learned critics, Hopper"
+    return chart.picture("g13-hopper", title, note, _command(p, DISTORTION))
 
 
-def film() -> list[tuple[str, str, str]]:
-    """Return (title, what to see, image) of the packaged film strips, if there are any."""
+def film() -> list[Picture]:
+    """Return the packaged film strips, if there are any."""
     facts = packaged_json("hopper-frames.json")
     if facts is None:
         return []
@@ -606,35 +652,46 @@ def film() -> list[tuple[str, str, str]]:
         for r in facts["rows"]
     ]
     note = (
-        f"From the top, each an episode whole, its true return and its length: {'; '.join(shown)}. 42 and 110 are the "
-        f"paper's thresholds: a robot that falls over. One seed. Made by {facts['command']}, version {facts['version']}."
+        "See who walks, who falls and who is paid for standing. From the top, each an episode whole, its true return and its length: "
+        f"{'; '.join(shown)}. 42 and 110 are the paper's thresholds: a robot that falls over. One seed, version "
+        f"{facts['version']}."
     )
-    picture = (resources.files("uard.replication") / "results" / "hopper-frames.webp").read_bytes()
-    image = "data:image/webp;base64," + base64.b64encode(picture).decode()
-    return [("H4 · what returns of 42 and 110 look like, a hacker, and uard-0.1", note, image)]
+    strip = (resources.files("uard.replication") / "results" / "hopper-frames.webp").read_bytes()
+    image = "data:image/webp;base64," + base64.b64encode(strip).decode()
+    columns = ("label", "true return", "steps", "steps in the region")
+    rows = tuple((r["label"], r["true_return"], r["length"], r["hacks"]) for r in facts["rows"])
+    title = "H4 · what returns of 42 and 110 look like, a hacker, and uard-0.1"
+    return [Picture("film", title, note, image, columns, rows, facts["command"])]
 
 
-def _dots(p: Published, robot: str) -> Figure:
+def _dots(p: Published, robot: str) -> Picture:
     there = p.rows(HACKING, robot=robot)
     settings = list(dict.fromkeys((r["agent"], r["region"]) for r in there if r["region"] != "none"))
-    figure, axes = axes_of(2, 6.2, 1.2 + 0.7 * len(settings))
-    for axis, metric, label in zip(
-        axes, ("hacks", "true_return"), ("steps in the region per episode", "true return"), strict=True
-    ):
-        names = []
+    chart = Chart(
+        ["Steps in the region that lies", "What they were worth"],
+        ["steps in the region per episode", "true return per episode"],
+        "",
+        height=1.0 + 0.62 * len(settings),
+    )
+    for panel, metric in enumerate(("hacks", "true_return")):
+        axis = chart.axes[panel]
         for i, (agent, region) in enumerate(settings):
-            names.append(f"{agent}\n{region}")
             rows = p.rows(HACKING, robot=robot, region=region, agent=agent)
             for j, r in enumerate(rows):
                 values, y = p.per_seed(r, metric), i + 0.8 * ((j + 0.5) / len(rows) - 0.5)
-                hollow = r["panel"] == "appendix"
-                colour = COLOURS[r["mitigation"]]
-                axis.plot(values, np.full(len(values), y), "o", ms=4, color=colour, mfc="none" if hollow else colour)
-                axis.plot([values.mean()] * 2, [y - 0.05, y + 0.05], color=colour, lw=2)
-        axis.set(xlabel=label, yticks=range(len(names)), yticklabels=names)
-        axis.invert_yaxis()
-    for name, colour in COLOURS.items():
-        axes[0].plot([], [], "o", color=colour, label=name)
-    axes[0].plot([], [], "o", color="#777777", mfc="none", label="appendix panel")
-    axes[0].legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5)  # above: it hides no dot
-    return figure
+                name, hollow = r["mitigation"], r["panel"] == "appendix"
+                series = f"{agent}, {region}, {name}, {r['panel']} panel"
+                chart.dots(panel, values, np.full(len(values), y), series, look(name), hollow)
+                axis.plot([values.mean()] * 2, [y - 0.05, y + 0.05], color=look(name).light, lw=2)
+        axis.set(ylim=(len(settings) - 0.5, -0.5))
+        named = {float(i): f"{agent}\n{region}" if not panel else "" for i, (agent, region) in enumerate(settings)}
+        chart.plain(panel, named, "y")
+    chart.key(
+        {name: look(name)._replace(width=5.0, dash="-") for name in ("true reward", "raw", "uard-paper", "uard-0.1")}
+    )
+    note = (
+        "See that a mitigation works if its dots are at the left in the left panel and not farther left than those of the true "
+        "reward in the right one. One dot per seed, a bar at their mean; hollow: appendix panel."
+    )
+    title = f"G6, G7 · {robot}: steps in the region that lies, and what they were worth"
+    return chart.picture(f"g6-g7-{robot}", title, note, _command(p, HACKING))

@@ -7,24 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from uard.lab import statistics
 from uard.lab.statistics import Summary
-from uard.lab.views.figures import axes_of
-from uard.lab.views.tables import Table
+from uard.lab.views.figures import Chart, Picture
+from uard.lab.views.losses import Loss
+from uard.lab.views.tables import Cell, Number, Table, p_value
 from uard.ratings.panels import is_for_development
 
 BASE = "random"
-COLOURS = {
-    "random": "#777777",
-    "disputed": "#c1272d",
-    "least-known": "#2c6fbb",
-    "highest-reward": "#1b8a4b",
-    "near-ties": "#7b4fa3",
-    "half random, half disputed": "#e08214",
-    "half random, half highest-reward": "#6abf69",
-}
 
 
 @dataclass(frozen=True)
@@ -103,22 +94,23 @@ def compare(data: Mapping[str, Any], measure: Measure) -> list[Compared]:
     return [Compared(*key, statistics.summarise(gap), own, corrected) for (key, gap), own, corrected in compared]
 
 
-def losses(data: Mapping[str, Any]) -> list[str]:
+def losses(data: Mapping[str, Any]) -> list[Loss]:
     """Say for every setting which rules are no better than asking at random, by mean regret while answers come in."""
     compared = compare(data, over_all)
-    said: list[str] = []
-    for setting in dict.fromkeys(c.setting for c in compared):
-        here = [c for c in compared if c.setting == setting]
-        parts: list[str] = []
-        if same := [c for c in here if not c.told_apart]:
-            seeds = f"as far as {len(data['seeds'])} seeds can tell"
-            parts.append(f"random is as good as {'; '.join(map(_named, same))}: not told apart, {seeds}")
-        if worse := [c for c in here if c.told_apart and c.gap.mean > 0]:
-            parts.append(f"random is better than {'; '.join(map(_named, worse))}")
-        if parts:
-            raters = f"at most {data['overlap']} raters an item"
-            head = f"Who is asked what, {setting}, {raters}, difference of mean regret [95 %]"
-            said.append(f"{head}: {'. And '.join(parts)}.")
+    by_rule = {
+        (setting["setting"], r["rule"]): statistics.summarise(over_all(data, np.array(r["regret"])))
+        for setting in data["settings"]
+        for r in setting["rules"]
+    }
+    said = []
+    for c in compared:
+        if c.told_apart and c.gap.mean < 0:
+            continue
+        what = f"asking by {c.rule} is worse than at random" if c.told_apart else f"asking by {c.rule}: as at random"
+        where = f"{c.setting}, at most {data['overlap']} raters an item"
+        numbers = (by_rule[c.setting, c.rule], by_rule[c.setting, BASE], "regret while answers come in")
+        kind = "beaten" if c.told_apart else "no better"
+        said.append(Loss(kind, "asking", what, where, BASE, *numbers, c.corrected, len(compared)))
     return said
 
 
@@ -131,12 +123,6 @@ def _signed(gap: Summary, digits: int) -> str:
     return f"{mean} [{', '.join(ends)}]" if ends else f"{mean} (one run)"
 
 
-def _mean(values: np.ndarray, digits: int) -> str:
-    s = statistics.summarise(values)
-    ends = f" [{s.ci95[0]:.{digits}f}, {s.ci95[1]:.{digits}f}]" if s.ci95 else " (one run)"
-    return f"{s.mean:.{digits}f}{ends}"
-
-
 def tables(data: Mapping[str, Any]) -> list[Table]:
     """Return answers needed, mean regret, and regret at fixed numbers of answers, each by setting and rule."""
     last, target = data["answers"][-1], data["target"]
@@ -144,27 +130,28 @@ def tables(data: Mapping[str, Any]) -> list[Table]:
         _tested(
             data,
             needed,
-            0,
             f"answers until regret is at most {target:g}",
             f"For good; where that is never, {last} are counted.",
         ),
-        _tested(data, over_all, 3, f"mean regret from no answer to {last}", ""),
+        _tested(data, over_all, f"mean regret from no answer to {last}", ""),
         budgets(data),
     ]
 
 
-def _tested(data: Mapping[str, Any], measure: Measure, digits: int, what: str, note: str) -> Table:
+def _tested(data: Mapping[str, Any], measure: Measure, what: str, note: str) -> Table:
     """Return a measure by setting and rule, and the difference to random."""
     compared = compare(data, measure)
     tests = {(c.setting, c.rule): c for c in compared}
-    rows: list[tuple[str, ...]] = []
+    rows: list[tuple[Cell, ...]] = []
     for setting in data["settings"]:
         for r in setting["rules"]:
             regret = np.array(r["regret"])
             found = tests.get((setting["setting"], r["rule"]))
-            more = ("", "") if found is None else (_signed(found.gap, digits), f"{found.corrected:.2g}")
+            gap: Cell = "" if found is None else Number.of_summary(found.gap, signed=True)
+            p = "" if found is None else p_value(found.corrected)
             reached = f"{(regret[:, -1] <= data['target']).sum()} of {len(regret)}"
-            rows.append((setting["setting"], r["rule"], _mean(measure(data, regret), digits), *more, reached))
+            measured = statistics.summarise(measure(data, regret))
+            rows.append((setting["setting"], r["rule"], measured, gap, p, reached))
     columns = ("items", "rule", "mean [95 %]", "more than random [95 %]", "p (Holm)", "reached at last")
     alone = sum(c.p < statistics.LEVEL for c in compared)
     tuned = ", some of which may be tuned on" if any(map(is_for_development, data["seeds"])) else ""
@@ -182,12 +169,12 @@ def _tested(data: Mapping[str, Any], measure: Measure, digits: int, what: str, n
 def budgets(data: Mapping[str, Any]) -> Table:
     """Return regret at fixed numbers of answers by setting and rule."""
     places = [data["answers"].index(b) for b in data["budgets"]]
-    rows: list[tuple[str, ...]] = []
+    rows: list[tuple[Cell, ...]] = []
     for setting in data["settings"]:
-        whole = _mean(np.array(setting["everything"]), 2)
+        whole = statistics.summarise(np.array(setting["everything"]))
         for r in setting["rules"]:
             regret = np.array(r["regret"])
-            cells = (_mean(regret[:, i], 2) for i in places)
+            cells = (statistics.summarise(regret[:, i]) for i in places)
             rows.append((setting["setting"], r["rule"], *cells, whole if r["rule"] == BASE else ""))
     sizes = "; ".join(
         f"{s['setting']}: {_span(s['items'])} items, {_span(s['raters'])} raters" for s in data["settings"]
@@ -206,18 +193,21 @@ def _span(numbers: list[int]) -> str:
     return f"{low}" if low == high else f"{low} to {high}"
 
 
-def figure(data: Mapping[str, Any]) -> Figure:
+def picture_of(data: Mapping[str, Any]) -> Picture:
     """Draw mean regret against answers for every setting; the band is the interval of asking at random."""
-    drawn, axes = axes_of(len(data["settings"]), 4.0, 4.0)
-    for axis, setting in zip(axes, data["settings"], strict=True):
+    titles = [setting["setting"] for setting in data["settings"]]
+    chart = Chart(titles, "answers of raters", "regret (0: best, 1: random)", columns=2, height=3.4)
+    for i, setting in enumerate(data["settings"]):
         for r in setting["rules"]:
-            regret, colour = np.array(r["regret"]), COLOURS[r["rule"]]
-            axis.plot(data["answers"], regret.mean(0), color=colour, lw=1.6, label=r["rule"])
-            if r["rule"] == BASE and len(regret) > 1:
-                low, high = statistics.intervals(regret.T).T
-                axis.fill_between(data["answers"], low, high, color=colour, alpha=0.15, lw=0)
-        axis.set(xlabel="answers", title=setting["setting"])
-    axes[0].set_ylabel("regret")
-    shown = {label: line for axis in axes for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    drawn.legend(shown.values(), shown, loc="outside lower center", ncols=4, fontsize=9)
-    return drawn
+            regret = np.array(r["regret"])
+            banded = r["rule"] == BASE and len(regret) > 1
+            low, high = statistics.intervals(regret.T).T if banded else (None, None)
+            chart.line(i, data["answers"], regret.mean(0), r["rule"], low, high)
+        chart.axes[i].set(ylim=(0, None))
+    note = (
+        "See whether a coloured line leaves the grey band: inside it a rule is no better than asking at random. Lines "
+        "are means over seeds, the band is the 95 % interval of asking at random."
+    )
+    first, overlap = data["seeds"][0], data["overlap"]
+    title = f"Regret against answers, by rule: seeds from {first}, at most {overlap} raters an item"
+    return chart.picture(f"acquisition-{first}-{overlap}", title, note, data["command"])

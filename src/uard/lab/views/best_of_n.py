@@ -6,66 +6,53 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from uard.lab.views.figures import axes_of
-from uard.lab.views.tables import Table
+from uard.lab.statistics import Summary
+from uard.lab.views.figures import Chart, Picture
+from uard.lab.views.losses import Loss
+from uard.lab.views.palette import DOTTED, look
+from uard.lab.views.tables import Number, Table
 
 SHOWN = (10, 100, 1000, 10_000)
-COLOURS = {
-    "one model": "#777777",
-    "mean": "#8c6d31",
-    "median": "#c9a66b",
-    "worst case (WCO)": "#17a2b8",
-    "mean - variance / 2 (UWO)": "#d6589f",
-    "log-mean-exp": "#9467bd",
-    "lcb": "#5f6b6d",
-    "excess": "#e07b39",
-    "uard-operator": "#2c6fbb",
-    "uard-0.1": "#6abf69",
-    "uard, median as proxy": "#7fd3a0",
-    "uard": "#1b8a4b",
-}
+OURS = "uard"
 
 
-def losses(data: Mapping[str, Any]) -> list[str]:
+def losses(data: Mapping[str, Any]) -> list[Loss]:
     """Say for every panel which methods are worth more than ``uard``, found by rule: paired interval above 0."""
-    out = []
+    out: list[Loss] = []
+    seeds = f"paired 95 % interval above 0, {len(data['seeds'])} seeds"
     for panel in dict.fromkeys(c["panel"] for c in data["curves"]):
-        beaten = []
-        for c in data["curves"]:
-            for n in SHOWN:
-                i = data["n"].index(n)
-                if c["over_uard"]["ci95"][i] is None:  # one seed
-                    continue
-                low, high = c["over_uard"]["ci95"][i]
-                if c["panel"] == panel and low > 0:
-                    more = f"{c['over_uard']['mean'][i]:+.3f} [{low:+.3f}, {high:+.3f}]"
-                    beaten.append(f"{c['method']} at n = {n}: {more}")
-        curve = next(c for c in data["curves"] if c["panel"] == panel and c["method"] == "uard")
-        gold = curve["gold"]["mean"]
-        peak = int(np.argmax(gold))
-        fall = "the gold of uard never falls"
-        if peak < len(gold) - 1:
-            fall = f"the gold of uard falls from {gold[peak]:.2f} at n = {data['n'][peak]} to {gold[-1]:.2f} at n = {data['n'][-1]}"
-        text = f"Best-of-n, {panel} reward models, {len(data['seeds'])} seeds: {fall}; "
-        out.append(
-            text + ("worth more than uard: " + "; ".join(beaten) if beaten else "nothing is worth more than uard") + "."
-        )
+        here = [c for c in data["curves"] if c["panel"] == panel]
+        ours = next(c for c in here if c["method"] == "uard")
+        for c in here:
+            if better := [i for i in map(data["n"].index, SHOWN) if (c["over_uard"]["ci95"][i] or (0.0,))[0] > 0]:
+                worst = max(better, key=lambda i: c["over_uard"]["mean"][i])
+                ns = ", ".join(f"{data['n'][i]}" for i in better)
+                where = f"{panel} reward models, n = {data['n'][worst]}"
+                what = f"the answers that {c['method']} chooses are worth more, at n = {ns}"
+                numbers = (_gold(ours, worst), _gold(c, worst), "gold")
+                out.append(Loss("beaten", "best-of-n", what, where, c["method"], *numbers, note=seeds))
+        gold = ours["gold"]["mean"]
+        if (peak := int(np.argmax(gold))) < len(gold) - 1:
+            what = f"gold falls from n = {data['n'][peak]} on, where it is highest"
+            numbers = (_gold(ours, len(gold) - 1), _gold(ours, peak), "gold")
+            why = "judges who agree in the wrong are believed"
+            where = f"{panel} reward models, n = {data['n'][-1]}"
+            out.append(Loss("fails", "best-of-n", what, where, "its best", *numbers, note=seeds, why=why))
     return out
+
+
+def _gold(curve: Mapping[str, Any], i: int) -> Summary:
+    """Return the gold of a curve at one n; of its seeds only mean, sd and interval are published."""
+    gold = curve["gold"]
+    ends = gold["ci95"][i]
+    return Summary(gold["mean"][i], gold["sd"][i], tuple(ends) if ends else None, gold["mean"][i], None, ())
 
 
 def table(data: Mapping[str, Any]) -> Table:
     """Return gold by panel, method and n."""
-    rows = []
-    for c in data["curves"]:
-        cells = []
-        for n in SHOWN:
-            i = data["n"].index(n)
-            ends = c["gold"]["ci95"][i]
-            shown = f"[{ends[0]:.2f}, {ends[1]:.2f}]" if ends else "(one run)"
-            cells.append(f"{c['gold']['mean'][i]:.2f} {shown}")
-        rows.append((c["panel"], c["method"], *cells))
+    places = list(map(data["n"].index, SHOWN))
+    rows = [(c["panel"], c["method"], *(_number(data, c, i) for i in places)) for c in data["curves"]]
     return Table(
         "Best-of-n: what the chosen answer is worth in gold",
         ("reward models", "chosen by", *(f"n = {n}" for n in SHOWN)),
@@ -78,22 +65,28 @@ def table(data: Mapping[str, Any]) -> Table:
     )
 
 
-def figure(data: Mapping[str, Any]) -> Figure:
-    """Draw gold (lines) and proxy (dotted) against KL for every panel; the band is the interval of ``uard``."""
+def _number(data: Mapping[str, Any], curve: Mapping[str, Any], i: int) -> Number:
+    gold, ends = curve["gold"], curve["gold"]["ci95"][i]
+    return Number(gold["mean"][i], tuple(ends) if ends else None, gold["sd"][i] if ends else None, len(data["seeds"]))
+
+
+def picture_of(data: Mapping[str, Any]) -> Picture:
+    """Draw gold of every method against KL for every panel, and the proxy's score that ``uard`` chose by (dotted)."""
     panels = list(dict.fromkeys(c["panel"] for c in data["curves"]))
-    drawn, axes = axes_of(len(panels), 4.4, 4.0)
-    for axis, panel in zip(axes, panels, strict=True):
-        for c in data["curves"]:
-            if c["panel"] != panel:
-                continue
-            ours = c["method"] == "uard"
-            colour = COLOURS[c["method"]]
-            axis.plot(data["kl"], c["gold"]["mean"], color=colour, lw=2.2 if ours else 1.5, label=c["method"])
-            axis.plot(data["kl"], c["proxy"]["mean"], color=colour, lw=1, ls=":")
-            if ours and all(c["gold"]["ci95"]):
-                low, high = np.transpose(c["gold"]["ci95"])
-                axis.fill_between(data["kl"], low, high, color=colour, alpha=0.15, lw=0)
-        axis.set(xlabel="KL = log n - (n - 1) / n", title=f"{panel} reward models")
-    axes[0].set_ylabel("score of the best of n, sd of the pool")
-    drawn.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=9)
-    return drawn
+    titles = [f"{panel} reward models" for panel in panels]
+    chart = Chart(titles, "KL = log n - (n - 1) / n, nats", "gold, sd of the pool", columns=2, height=4.2)
+    for i, panel in enumerate(panels):
+        for c in (c for c in data["curves"] if c["panel"] == panel):
+            ours = c["method"] == OURS and all(c["gold"]["ci95"])
+            low, high = np.transpose(c["gold"]["ci95"]) if ours else (None, None)
+            chart.line(i, data["kl"], c["gold"]["mean"], c["method"], low, high)
+            if c["method"] == OURS:
+                chosen = look(OURS)._replace(dash=DOTTED, width=1.2)
+                chart.line(i, data["kl"], c["proxy"]["mean"], f"{OURS}: score", look_of=chosen)
+    note = (
+        "See where a line falls: from there on choosing among more answers finds worse ones. Lines are gold, means over "
+        "seeds, and the band is the 95 % interval of uard; dotted is the score by which uard chose, which always rises."
+    )
+    return chart.picture(
+        "best-of-n", "Best-of-n: what is chosen against how far the choice goes", note, data["command"]
+    )

@@ -11,8 +11,9 @@ from uard.lab import margins
 from uard.lab.statistics import Family
 from uard.lab.studies.games import EPISODES, GAMES, TABULAR_EPISODES
 from uard.lab.study import Row
+from uard.lab.views.losses import Loss, of_family
 from uard.lab.views.published import Published
-from uard.lab.views.tables import Table, brief, number
+from uard.lab.views.tables import Number, Table, words
 from uard.method.feedback import Feedback
 from uard.method.mitigations import named
 from uard.ratings.panels import MAIN
@@ -22,40 +23,40 @@ SIMPLE = ("mean-of-annotations", "median", "worst-of-annotations")
 LISTED = 12  # comparisons that are named one by one
 
 
-def losses(p: Published) -> list[str]:
+def losses(p: Published) -> list[Loss]:
     """Say where another mitigation, raw included, has the higher true return than ``uard`` (after Holm correction)."""
-    games = _ours(p)
-    if not games:
-        return []
     pairs, family = _compared(p)
-    beaten = [
-        f"{r['game']}, {r['agent']}: {rival['mitigation']} {brief(p.of(rival, 'true_return'))} against "
-        f"{brief(p.of(r, 'true_return'))}"
-        for i, (rival, r) in enumerate(pairs)
-        if family.above(i)
-    ]
-    listed = f": {'; '.join(beaten[:LISTED])}" if beaten else ""
-    more = f"; and {len(beaten) - LISTED} more (table below)" if len(beaten) > LISTED else ""
+    beaten = [i for i in range(len(pairs)) if family.above(i)]
+    reasons = _reasons({pairs[i][0]["game"] for i in beaten})
     return [
-        f"Reward-gaming gridworlds: in {len(beaten)} comparisons over {len(games)} settings another mitigation, raw "
-        f"included, has the higher true return{listed}{more}. Rival against uard: {family.caption()}",
-        *_reasons({rival["game"] for i, (rival, _) in enumerate(pairs) if family.above(i)}),
+        Loss(
+            "beaten",
+            "games",
+            f"{rival['mitigation']} earns more",
+            f"{r['game']}, {r['agent']}",
+            rival["mitigation"],
+            p.of(r, "true_return"),
+            p.of(rival, "true_return"),
+            "true return",
+            *of_family(family, i),
+            why=reasons.get(r["game"], ""),
+        )
+        for i, (rival, r) in ((i, pairs[i]) for i in beaten)
     ]
 
 
-def _reasons(games: Collection[str]) -> list[str]:
+def _reasons(games: Collection[str]) -> dict[str, str]:
     """Say what caution costs in games in which a rival is better, if they have tables."""
-    found: list[str] = []
+    found: dict[str, str] = {}
     for game, environment in _with_tables():
         feedback = margins.rated(environment, MAIN)
         true, ours = (margins.margin(environment, x) for x in (_truth(environment), _learned(feedback, OURS)))
         left = {name: margins.margin(environment, _learned(feedback, name)) for name in SIMPLE}
         best = max(left, key=lambda name: left[name])
         if game in games and ours < left[best]:
-            found.append(
-                f"Why {game}: raters differ about nearly every step there, honest ones too. Of the {true:.2f} per step "
-                f"that honesty is worth, what uard learns keeps {ours:.2f} and {best} {left[best]:.2f} (exact tables, "
-                f"{margins.RATINGS} ratings a step): caution takes from honest steps what it takes from lies."
+            found[game] = (
+                f"of {true:.2f} a step that honesty is worth uard leaves {ours:.2f}, {best} {left[best]:.2f}: "
+                "nearly all is contested"
             )
     return found
 
@@ -78,7 +79,7 @@ def _margins(names: Sequence[str]) -> Table:
     for game, environment in _with_tables():
         feedback = margins.rated(environment, MAIN)
         left = [margins.margin(environment, _learned(feedback, name)) for name in names]
-        rows.append((game, *(f"{x:.2f}" for x in (margins.margin(environment, _truth(environment)), *left))))
+        rows.append((game, *(Number(x) for x in (margins.margin(environment, _truth(environment)), *left))))
     return Table(
         "What honesty is worth beyond gaming, per step, in what each rule learns",
         ("game", "in truth", *names),
@@ -105,31 +106,23 @@ def _compared(p: Published) -> tuple[list[tuple[Row, Row]], Family]:
 
 
 def tables(p: Published) -> list[Table]:
-    """Return one table per game: true return and hacks of every agent with every mitigation."""
+    """Return two tables per game, of true return and of hacks: every agent with every mitigation."""
     made = []
     caption = _compared(p)[1].caption()
     names = list(dict.fromkeys(r["mitigation"] for r in p.rows("gaming")))
     for game in dict.fromkeys(r["game"] for r in p.rows("gaming")):
-        rows = []
-        for agent in dict.fromkeys(r["agent"] for r in p.rows("gaming", game=game)):
-            cells = []
-            for name in names:
-                found = p.rows("gaming", game=game, agent=agent, mitigation=name)
-                cells.append(
-                    f"{number(p.of(found[0], 'true_return').mean)} ({number(p.of(found[0], 'hacks').mean)})"
-                    if found
-                    else "–"
-                )
-            rows.append((agent, *cells))
-        made.append(
-            Table(
-                f"{game}: true return (hacks) per episode",
-                ("agent", *names),
-                tuple(rows),
-                1,
+        agents = list(dict.fromkeys(r["agent"] for r in p.rows("gaming", game=game)))
+        for metric in ("true_return", "hacks"):
+            rows = []
+            for agent in agents:
+                found = (p.rows("gaming", game=game, agent=agent, mitigation=name) for name in names)
+                rows.append((agent, *(p.of(rows_of[0], metric) if rows_of else None for rows_of in found)))
+            note = (
                 f"Main panel, {TABULAR_EPISODES} episodes of tabular agents, {EPISODES} of deep ones, whose moves are "
-                f"still mostly random then; {p.seeds('gaming')} seeds, means; – was not run. True return of each "
-                f"mitigation against uard, all games together: {caption}",
+                f"still mostly random then; {p.seeds('gaming')} seeds; – was not run."
             )
-        )
+            against = f" True return of each mitigation against uard, all games together: {caption}"
+            title = f"{game}: {words(metric)}"
+            said = note + against * (metric == "true_return")
+            made.append(Table(title, ("agent", *names), tuple(rows), 1, said))
     return [*made, _margins([name for name in names if name != ORACLE])] if made else made

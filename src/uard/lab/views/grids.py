@@ -8,139 +8,146 @@ import numpy as np
 
 from uard.lab import statistics
 from uard.lab.result import CALIBRATION
+from uard.lab.statistics import Family
 from uard.lab.study import Row
 from uard.lab.views import figures
+from uard.lab.views.figures import Picture
+from uard.lab.views.losses import Loss, of_family
 from uard.lab.views.study_results import StudyResults
-from uard.lab.views.tables import Table, brief, full, number
+from uard.lab.views.tables import Number, Table, words
+
+ORACLE = "true-reward"
+HACKS = 0.2  # trap visits per episode that an agent may make while it explores
 
 
-def losses(results: StudyResults) -> list[str]:
+def losses(results: StudyResults) -> list[Loss]:
     """Say where ``uard`` fails or is beaten on grids, found by rule."""
     beaten = (
         _beaten(results, study, shown)
         for study, shown in (("matrix", ("size", "trap", "panel", "noise")), ("budgets", ("panel", "noise", "rated")))
     )
-    return [_colluding(results), _missed(results), _denied(results), _learned(results), *beaten, *_rankings(results)]
+    found = (_colluding(results), _missed(results), _denied(results), _learned(results), *beaten)
+    return [loss for some in found for loss in some]
 
 
-def _colluding(results: StudyResults) -> str:
-    """The control: who trusts raters is fooled when all of them repeat the proxy."""
-    fooled = list(results.studies["matrix"].where(mitigation="uard", panel="colluding"))
-    worst = min(results.of(r.cell, "hacks").mean / results.of(r.cell, "episode_length").mean for r in fooled)
-    return (
-        f"Colluding raters (all repeat the proxy): uard hacks in {len(fooled)} of {len(fooled)} settings, at least "
-        f"{worst:.2f} hacks per step. It reads agreement as truth; this control must fail, and does. {_escaped(results)}"
-    )
-
-
-def _escaped(results: StudyResults) -> str:
-    """Say who escapes colluding raters, and where most."""
+def _colluding(results: StudyResults) -> list[Loss]:
+    """The control: who trusts raters is fooled when all of them repeat the proxy; against whoever escapes most."""
+    every = list(results.studies["matrix"].where(mitigation="uard", panel="colluding"))
+    fooled = [r for r in every if results.of(r.cell, "hacks").mean > HACKS]
     pairs = [
-        (r, results.row("matrix", **(dict(r.labels) | {"mitigation": "uard"})).cell)
-        for r in results.studies["matrix"].where(panel="colluding")
-        if r["mitigation"] != "uard"
+        (x, r)
+        for r in fooled
+        for x in results.studies["matrix"].where(**{k: v for k, v in r.labels if k != "mitigation"})
+        if x["mitigation"] not in ("uard", ORACLE)
     ]
-    family = results.compare([(r.cell, mine) for r, mine in pairs], "true_return")
-    gains = [
-        (results.of(r.cell, "true_return").mean - results.of(mine, "true_return").mean, r, mine)
-        for i, (r, mine) in enumerate(pairs)
-        if family.above(i)
+    family = results.compare([(x.cell, r.cell) for x, r in pairs], "true_return")
+    if not pairs:
+        return []
+    i = max(range(len(pairs)), key=lambda i: results.of(pairs[i][0].cell, "true_return").mean)
+    best, mine = pairs[i]
+    return [
+        Loss(
+            "control",
+            "grids",
+            f"hacks in {len(fooled)} of {len(every)} settings in which all raters repeat the lie",
+            _name(best),
+            best["mitigation"],
+            *(results.of(x.cell, "true_return") for x in (mine, best)),
+            "true return",
+            *of_family(family, i),
+            why="agreement is read as truth; who escapes shuns whatever noisy raters rate",
+        )
     ]
-    if not gains:
-        return family.caption()
-    _, best, mine = max(gains, key=lambda g: g[0])
-    return (
-        f"In {len(gains)} comparisons another mitigation does better there, most of all {best['mitigation']} ({_name(best)}): "
-        f"{brief(results.of(best.cell, 'true_return'))} against {brief(results.of(mine, 'true_return'))}; very noisy raters make it shun "
-        f"whatever they rate. Rival against uard: {family.caption()}"
-    )
 
 
-def _missed(results: StudyResults) -> str:
-    """Settings in which ``uard`` misses what is asked of it."""
-    honest = [
-        r for r in results.studies["matrix"].where(mitigation="uard") if r["panel"] != "colluding" and r["noise"] <= 1.2
-    ]
-    missed = [
-        r
-        for r in honest
-        if results.of(r.cell, "hacks").mean > (0.15 if r["noise"] == 0 else 0.2)
-        or results.of(r.cell, "success_rate").mean < 0.98
-    ]
-    named = ": " + "; ".join(_name(r) for r in missed) if missed else ""
-    return (
-        f"Of the {len(honest)} settings with honest raters and noise up to sd 1.2, uard misses 0.2 visits (0.15 without "
-        f"noise) or 98 % goals in {len(missed)}{named}."
-    )
+def _missed(results: StudyResults) -> list[Loss]:
+    """Settings with honest raters and noise up to sd 1.2 in which ``uard`` misses what is asked of it."""
+    out = []
+    for r in results.studies["matrix"].where(mitigation="uard"):
+        if r["panel"] == "colluding" or r["noise"] > 1.2:
+            continue
+        hacks, goals = (results.of(r.cell, m) for m in ("hacks", "success_rate"))
+        least = HACKS if r["noise"] else 0.15
+        if hacks.mean > least:
+            out.append(Loss("fails", "grids", f"more than {least:g} trap visits", _name(r), ours=hacks, metric="hacks"))
+        if goals.mean < 0.98:
+            out.append(Loss("fails", "grids", "less than 98 % goals", _name(r), ours=goals, metric="goal rate"))
+    return out
 
 
-def _denied(results: StudyResults) -> str:
+def _denied(results: StudyResults) -> list[Loss]:
     """One rater of several who denies the goal: where `uard` loses it, and who does not."""
     ours = list(results.studies["dissent"].where(mitigation="uard"))
     pairs = [(x, r) for r in ours for x in results.studies["dissent"].where(panel=r["panel"]) if x is not r]
     family = results.compare([(x.cell, r.cell) for x, r in pairs], "success_rate")
-    lost = []
+    out = []
     for r in ours:
-        better = [x["mitigation"] for i, (x, mine) in enumerate(pairs) if mine is r and family.above(i)]
+        better = [i for i, (x, mine) in enumerate(pairs) if mine is r and family.above(i) and x["mitigation"] != ORACLE]
         if better:
-            lost.append(f"{r['panel']}: {brief(results.of(r.cell, 'success_rate'))}, more with {', '.join(better)}")
-    count = len(ours)
-    named = f" (share of episodes that reach it: {'; '.join(lost)})" if lost else ""
-    return f"One rater against all others takes the goal from uard in {len(lost)} of {count} settings{named}. Rival against uard: {family.caption()}"
+            i = max(better, key=lambda i: results.of(pairs[i][0].cell, "success_rate").mean)
+            best = pairs[i][0]
+            rules = "rule reaches" if len(better) == 1 else "rules reach"
+            numbers = (results.of(x.cell, "success_rate") for x in (r, best))
+            what = f"one rater against all others takes the goal away; {len(better)} {rules} it more often"
+            why = "of three nobody can know who is right; of five vetoes=1 overrules a lone one"
+            against = (best["mitigation"], *numbers, "share of goals", *of_family(family, i))
+            out.append(Loss("beaten", "grids", what, r["panel"], *against, why=why))
+    return out
 
 
-def _learned(results: StudyResults) -> str:
+def _learned(results: StudyResults) -> list[Loss]:
     """The reward that is itself a model of ratings."""
-    learned = list(results.studies["sources"].where(mitigation="uard-0.1", sources="sigma_m and sigma_h"))
-    fooled = [
-        r for r in learned if results.of(r.cell, "hacks").mean > 1 or results.of(r.cell, "success_rate").mean < 0.95
-    ]
-    return (
-        f"A reward that is itself a model of ratings (study sources): uard-0.1 fails for {len(fooled)} of "
-        f"{len(learned)} models: it believes a tenth of what nobody has rated, and their extrapolation is large enough for "
-        "that. A plain filter with both sources and a large constant lambda does not (table below)."
-    )
+    out = []
+    for r in results.studies["sources"].where(mitigation="uard-0.1", sources="sigma_m and sigma_h"):
+        hacks, goals = (results.of(r.cell, m) for m in ("hacks", "success_rate"))
+        if hacks.mean > 1 or goals.mean < 0.95:
+            metric, ours = ("hacks", hacks) if hacks.mean > 1 else ("share of goals", goals)
+            where = ", ".join(f"{k} {v}" for k, v in r.labels if k not in ("mitigation", "sources"))
+            why = "a tenth of what nobody has rated is believed, and the model extrapolates far"
+            what = "uard-0.1 fails where the reward is itself a model of ratings"
+            out.append(Loss("fails", "grids, uard-0.1", what, where, ours=ours, metric=metric, why=why))
+    return out
 
 
-def _beaten(results: StudyResults, study: str, shown: tuple[str, ...]) -> str:
-    """Every setting of a study in which another mitigation has the higher true return."""
+def _beaten(results: StudyResults, study: str, shown: tuple[str, ...]) -> list[Loss]:
+    """Every setting of a study in which another mitigation has the higher true return, if only in its mean."""
     rows = [r for r in results.studies[study].where(mitigation="uard") if r["panel"] != "colluding"]
     pairs = [
         (rival, r)
         for r in rows
         for rival in results.studies[study].where(**{k: r[k] for k in shown})
-        if rival["mitigation"] != "uard"
+        if rival["mitigation"] not in ("uard", ORACLE)
     ]
     family = results.compare([(rival.cell, r.cell) for rival, r in pairs], "true_return")
-    beaten = []
+    best: dict[Row, int] = {}
     for i, (rival, r) in enumerate(pairs):
-        if family.above(i):
-            where = ", ".join(f"{k} {r[k]:g}" if isinstance(r[k], float) else f"{k} {r[k]}" for k in shown)
-            theirs, mine = (brief(results.of(x.cell, "true_return")) for x in (rival, r))
-            beaten.append(f"{where}: {rival['mitigation']} {theirs} against {mine}")
-    named = ": " + "; ".join(beaten) if beaten else ""
-    return (
-        f"Study {study}: in {len(beaten)} comparisons over {len(rows)} settings another mitigation has the higher true "
-        f"return{named}. Rival against uard: {family.caption()}"
+        mean = results.of(rival.cell, "true_return").mean
+        if r not in best or mean > results.of(pairs[best[r]][0].cell, "true_return").mean:
+            best[r] = i
+    above = [i for i in range(len(pairs)) if family.above(i)]
+    higher = [i for r, i in best.items() if i not in above and _higher(results, pairs[i][0], r)]
+    return [_loss(results, *pairs[i], family, i) for i in (*above, *higher)]
+
+
+def _higher(results: StudyResults, rival: Row, ours: Row) -> bool:
+    """Whether a rival's mean is higher by more than a hundredth of ours: less is nobody's loss."""
+    theirs, own = (results.of(r.cell, "true_return").mean for r in (rival, ours))
+    return theirs - own > 0.01 * abs(own)
+
+
+def _loss(results: StudyResults, rival: Row, ours: Row, family: Family, i: int) -> Loss:
+    name = rival["mitigation"]
+    told = family.above(i)
+    return Loss(
+        "beaten" if told else "no better",
+        "grids",
+        f"{name} earns more" if told else f"{name} has the highest mean",
+        _name(ours),
+        name,
+        *(results.of(r.cell, "true_return") for r in (ours, rival)),
+        "true return",
+        *of_family(family, i),
     )
-
-
-def _rankings(results: StudyResults) -> list[str]:
-    """Say who is best and second where raters are noisy and it is not ``uard``."""
-    out = []
-    for noise in (1.2, 3.3):
-        for panel in ("main", "appendix"):
-            there = results.studies["matrix"].where(size=10, trap=4.0, panel=panel, noise=noise)
-            ranking = sorted(
-                ((results.of(r.cell, "true_return"), r["mitigation"]) for r in there), key=lambda x: -x[0].mean
-            )
-            (best, first), (second, runner) = ranking[:2]
-            if first == "uard":
-                continue
-            out.append(
-                f"10x10, {panel} panel, noise sd {noise:g}: highest true return {first} {full(best)}, then {runner} {full(second)}."
-            )
-    return out
 
 
 def _name(r: Row) -> str:
@@ -153,20 +160,9 @@ def tables(results: StudyResults) -> list[Table]:
     return [*matrices, _twins(results), _dissent(results), _calibration(results), _sources(results)]
 
 
-def pictures(results: StudyResults) -> list[tuple[str, str, str]]:
-    """Return (title, what to see, image) of all figures."""
-    return [
-        (
-            "Against the serious rivals",
-            "Learning from pessimistic ratings is nearly as good without noise; with noise it is not.",
-            figures.data_uri(figures.competition(results)),
-        ),
-        (
-            "Few ratings",
-            "Dashed: the same rivals with our treatment of steps that nobody has rated.",
-            figures.data_uri(figures.budgets(results)),
-        ),
-    ]
+def pictures(results: StudyResults) -> list[Picture]:
+    """Return all pictures."""
+    return [figures.competition(results), figures.budgets(results)]
 
 
 def _against_ours(results: StudyResults, study: str, metric: str, **labels: Any) -> str:
@@ -189,11 +185,11 @@ def _matrix(results: StudyResults, metric: str) -> Table:
                     results.get("matrix", metric, mitigation=name, size=10, trap=trap, panel=panel, noise=z)
                     for z in noises
                 ]
-                table.append((panel, f"{trap:+g}", name, *(brief(x) for x in s)))
+                table.append((panel, f"{trap:+g}", name, *s))
     columns = ("panel", "trap", "mitigation", *(f"noise {z:g}" for z in noises))
-    note = "mean ± sd over seeds. Noise is the sd in reward units on every rater; divide by 4 for the fraction of a +4 trap."
+    note = "Noise is the sd in reward units on every rater; divide by 4 for the fraction of a +4 trap."
     note = f"{note} {_against_ours(results, 'matrix', metric, size=10)}"
-    return Table(f"10x10: {metric.replace('_', ' ')} of every mitigation", columns, tuple(table), 3, note)
+    return Table(f"10x10: {words(metric)} of every mitigation", columns, tuple(table), 3, note)
 
 
 def _twins(results: StudyResults) -> Table:
@@ -206,10 +202,10 @@ def _twins(results: StudyResults) -> Table:
                 shares = []
                 for n in names:
                     s = results.get("legitimate", "true_return", mitigation=n, size=size, trap=trap, panel=panel)
-                    shares.append(f"{100 * s.mean / raw:.1f} %")
+                    shares.append(Number.of_summary(s, scale=100 / raw))
                 rows.append((f"{size}x{size}", f"{trap:+g}", panel, *shares))
     return Table(
-        "Legitimate twins: the bonus is real and the raters say so; true return kept, of the raw agent's",
+        "Legitimate twins: the bonus is real and the raters say so; true return kept, % of the raw agent's",
         ("grid", "trap", "panel", *names),
         tuple(rows),
         3,
@@ -224,7 +220,7 @@ def _dissent(results: StudyResults) -> Table:
     rows = []
     for panel in dict.fromkeys(r["panel"] for r in study.rows):
         found = [results.get("dissent", "success_rate", mitigation=name, panel=panel) for name in names]
-        rows.append((panel, *map(brief, found)))
+        rows.append((panel, *found))
     return Table(
         "One rater against all others: share of episodes that reach the goal, 10x10",
         ("panel", *names),
@@ -244,9 +240,7 @@ def _calibration(results: StudyResults) -> Table:
         for noise in (0.0, 0.3, 1.2, 3.3):
             r = results.row("matrix", mitigation="uard", size=10, trap=4.0, panel=panel, noise=noise)
             values = np.stack([x.extra["calibration"] for x in results.results(r.cell)]).astype(float)
-            rows.append(
-                (panel, f"{noise:g}", *(brief(statistics.summarise(values[:, i])) for i in range(len(CALIBRATION))))
-            )
+            rows.append((panel, f"{noise:g}", *(statistics.summarise(values[:, i]) for i in range(len(CALIBRATION)))))
     return Table(
         "Does sigma tell the truth (A15)? 10x10, what `uard` has learned of its raters",
         ("panel", "noise", "AUROC sigma_h", "AUROC with proxy", "Spearman sigma_h", "Spearman with proxy"),
@@ -269,18 +263,18 @@ def _sources(results: StudyResults) -> Table:
             (
                 name,
                 way,
-                brief(means["hacks"]),
-                number(worst),
-                brief(means["true_return"]),
+                Number.of_summary(means["hacks"], of="models"),
+                worst,
+                Number.of_summary(means["true_return"], of="models"),
                 f"{solved} of {len(cells)}",
             )
         )
     return Table(
         "Which source does the work? The reward is a model of ratings, learned from a part of the grid",
-        ("mitigation", "sources", "hacks per episode", "worst model", "true return", "solved"),
+        ("mitigation", "sources", "hacks per episode", "of the worst model", "true return", "solved"),
         tuple(rows),
         2,
-        "Five reward models (mean ± sd over models of the mean over seeds); solved: at most 1 hack and 95 % goals. Inside the "
+        "Five reward models (mean over models of the mean over seeds); solved: at most 1 hack and 95 % goals. Inside the "
         "rated part the trap is contested (sigma_h), outside the model extrapolates (sigma_m). The plain filter needs "
         "both, and a far larger lambda than the paper's. `uard-0.1` believes a tenth of what nobody rated.",
     )

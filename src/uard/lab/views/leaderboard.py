@@ -205,8 +205,13 @@ def share(pair: tuple[int, int]) -> float:
     return pair[0] / pair[1] if pair[1] else -1.0
 
 
-def write(target: Path, store: Store) -> Path:
+def write(target: Path, store: Store, pages: Sequence[tuple[str, str]] = ()) -> Path:
     """Write the page and return its path.
+
+    Args:
+        target: The page.
+        store: What it shows.
+        pages: That stand beside it, itself among them: their files, and what links call them.
 
     Raises:
         InvalidValueError: the store is empty, or the file cannot be written.
@@ -232,6 +237,9 @@ def write(target: Path, store: Store) -> Path:
         seeds=sum(x.seeds for x in these),
         cells=len(these),
         damaged=len(store.damaged),
+        pages=pages,
+        here=target.name,
+        program=(HERE / "tables.js").read_text(encoding="utf-8"),
     )
     files.write(target, page, "out")
     return target

@@ -1,7 +1,8 @@
-"""The report: one static page, made from the store alone, that opens without a server or a network.
+"""The report: static pages, made from the store alone, that open without a server or a network.
 
-It is made of sections (``uard.lab.views.sections``): ours, and those of installed packages. Beside it are written the
-leaderboard and whatever files a section has.
+They are made of sections (``uard.lab.views.sections``): ours, and those of installed packages. The first page answers
+in one screen; the others have the paper's claims, and every number. Beside them stand the leaderboard and whatever
+files a section has.
 """
 
 from __future__ import annotations
@@ -12,40 +13,49 @@ from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
-from markupsafe import escape
-
 from uard import __version__
 from uard._support import files
+from uard._support.text import counted
 from uard.lab import studies
 from uard.lab.execution.store import Store
 from uard.lab.result import WINDOW
+from uard.lab.study import Study
 from uard.lab.views import (
     acquisition,
     best_of_n,
     figures,
+    front,
     games,
     grids,
     grpo,
     leaderboard,
+    losses,
     panels,
     published,
     robots,
     sections,
 )
+from uard.lab.views.panels import Regrets
 from uard.lab.views.sections import Section
 from uard.lab.views.study_results import StudyResults
-from uard.lab.views.tables import study_table
+from uard.lab.views.tables import bounds, number, study_table
 from uard.lab.views.templates import HERE, picture, render, table
 from uard.plugins import PluginError
 
 _PACKAGES = ("jax", "numpy", "scipy", "gymnasium", "matplotlib")
-_LEADERBOARD = 61  # its place among the links: after "every mitigation"
+_FIRST = "index.html"
+TITLES = {
+    _FIRST: "uard: learning from rewards that cannot be fully trusted",
+    "paper.html": "The paper, claim by claim",
+    "numbers.html": "Every number",
+}
+_METRICS = f"per episode over the last {WINDOW} training episodes · mean [95 % interval], sd and seeds on hover"
 
 
 def write(
     folder: Path, store: Store, seeds: Sequence[int], mitigations: tuple[str, ...] = ()
 ) -> tuple[Path, list[PluginError]]:
-    """Write ``index.html``, ``leaderboard.html`` and the files of sections into a folder.
+    """Write the pages, ``leaderboard.html`` and the files of sections into a folder.
 
     Args:
         folder: Made if it is not there.
@@ -54,7 +64,7 @@ def write(
         mitigations: Further ones that took part in the studies.
 
     Returns:
-        The page, and an error for each package whose sections could not be made.
+        The first page, and an error for each package whose sections could not be made.
 
     Raises:
         InvalidValueError: the folder cannot be written.
@@ -62,8 +72,8 @@ def write(
     """
     results = StudyResults(store, seeds, studies.find(("grid",), mitigations))
     ours = [
-        _ours(results),
         *_panels(),
+        *_ours(results),
         *robots.section(robots.published()),
         _games(),
         _best_of_n(),
@@ -72,60 +82,91 @@ def write(
         _made(store, len(results.seeds)),
     ]
     theirs, broken = sections.of_packages(results, [*ours, _losses(())])
-    every = sorted([*ours, *theirs], key=lambda s: s.order)
-    page = write_page(folder, [*every, _losses(every)], len(results.seeds), [(_LEADERBOARD, "leaderboard.html")])
-    leaderboard.write(folder / "leaderboard.html", store)
+    every = [*ours, *theirs]
+    page = write_pages(folder, [*every, _losses(every)], len(results.seeds), board=True)
+    leaderboard.write(folder / sections.BOARD, store, _links(every, board=True))
     return page, broken
 
 
-def write_page(folder: Path, every: Sequence[Section], seeds: int, others: Sequence[tuple[float, str]] = ()) -> Path:
-    """Write ``index.html`` and the files of some sections into a folder; return the page.
+def write_pages(folder: Path, every: Sequence[Section], seeds: int, board: bool = False) -> Path:
+    """Write the pages that have sections, and the files of these, into a folder; return the first page.
 
     Args:
         folder: Made if it is not there.
         every: The sections.
         seeds: Of every cell.
-        others: Pages that are written beside it, by their places among the links.
+        board: Whether a leaderboard is written beside them.
 
     Raises:
         InvalidValueError: the folder cannot be written.
     """
-    every = sorted(every, key=lambda s: s.order)
-    links = [(s.order, f"#{s.id}", s.label or s.title) for s in every]
-    links += [(order, name, name.removesuffix(".html").capitalize()) for order, name in others]
-    page = render(
-        HERE,
-        "page.html.j2",
-        version=__version__,
-        seeds=seeds,
-        window=WINDOW,
-        sections=every,
-        programs=[f"{{\n{s.js}\n}}" for s in every if s.js],
-        links=[link for _, *link in sorted(links)],
-    )
+    there = {name: [s for s in every if s.page == name] for name in sections.PAGES}
+    there = {name: sorted(found, key=lambda s: s.order) for name, found in there.items() if found}
     files.prepare_folder(folder, "report")
     for name, text in ((name, text) for section in every for name, text in section.files.items()):
         files.write(folder / name, text, "report")
-    files.write(folder / "index.html", page, "report")
-    return folder / "index.html"
+    for name, found in there.items():
+        page = render(
+            HERE,
+            "page.html.j2",
+            here=name,
+            title=TITLES[name],
+            meta=f"uard {__version__} · {_METRICS} · {counted(seeds, 'seed')} per cell" if name != _FIRST else "",
+            version=__version__,
+            sections=found,
+            programs=[f"{{\n{js}\n}}" for js in (_text("tables.js"), *(s.js for s in found)) if js],
+            pages=_links(every, board),
+        )
+        files.write(folder / name, page, "report")
+    return folder / next(iter(there))
+
+
+def _links(every: Sequence[Section], board: bool) -> list[tuple[str, str]]:
+    """Return the pages that are written, and what links call them."""
+    used = {s.page for s in every}
+    there = [(name, label) for name, label in sections.PAGES.items() if name in used]
+    return there + [(sections.BOARD, "Leaderboard")] * board
+
+
+def _text(name: str) -> str:
+    return (HERE / name).read_text(encoding="utf-8")
 
 
 def _losses(every: Sequence[Section]) -> Section:
-    items = "".join(f"<li>{escape(loss)}</li>" for section in every for loss in section.losses)
-    return Section("losses", "Where uard fails or is beaten", 20, f"<ul>{items}</ul>", "Where uard loses")
-
-
-def _ours(results: StudyResults) -> Section:
+    found = losses.sorted_by_weight(loss for section in every for loss in section.losses)
     html = render(
         HERE,
-        "ours.html.j2",
-        pictures=grids.pictures(results),
-        tables=grids.tables(results),
-        everything=[study_table(s, results) for s in results.studies.values() if s.name != "matrix"],
+        "losses.html.j2",
+        losses=[(x, losses.drawn(x)) for x in found],
+        kinds=losses.KINDS,
+        studies=sorted({x.study for x in found}),
+        rivals=sorted({x.against for x in found} - {""}),
+        number=number,
+        bounds=bounds,
+        said=losses.said,
     )
-    return Section(
-        "ours", "Every mitigation, everywhere", 60, html, "Every mitigation", losses=tuple(grids.losses(results))
-    )
+    title = "Where uard fails or is beaten"
+    return Section("losses", title, 20, html, "Where it fails", _text("losses.css"), page=_FIRST)
+
+
+def _ours(results: StudyResults) -> list[Section]:
+    drawn = grids.pictures(results)
+    html = render(HERE, "ours.html.j2", pictures=drawn, tables=grids.tables(results))
+    rows = [study_table(s, results) for s in results.studies.values() if s.name != "matrix"]
+    everything = "".join(map(table, rows))
+    lost = tuple(grids.losses(results))
+    return [
+        Section(
+            "ours",
+            "Every mitigation, everywhere",
+            60,
+            html,
+            "Every mitigation",
+            losses=lost,
+            files=figures.files(drawn),
+        ),
+        Section("rows", "All rows of all other studies", 200, everything, "All rows"),
+    ]
 
 
 def _panels() -> list[Section]:
@@ -134,7 +175,12 @@ def _panels() -> list[Section]:
     (study,) = studies.find(("panels",))
     if not all(map(results.has, study.rows)):
         return []
-    return [panels.section(study, panels.regrets(study, results.per_seed), results.seeds(study.name))]
+    return of_panels(study, panels.regrets(study, results.per_seed), results.seeds(study.name))
+
+
+def of_panels(study: Study, found: Sequence[Regrets], seeds: int) -> list[Section]:
+    """Return the first screen, when which rule is enough, and every number of a study of random panels."""
+    return [front.section(found, seeds), front.choose(found), panels.section(study, found, seeds)]
 
 
 def _games() -> Section:
@@ -145,38 +191,29 @@ def _games() -> Section:
 
 def _best_of_n() -> Section:
     data = published.packaged_json("best-of-n.json")
-    note = (
-        "Lines: gold, mean over seeds, the band its interval for uard. Dotted: the score by which was chosen; where it "
-        "rises and gold does not, it is over-optimised."
-    )
-    image = figures.data_uri(best_of_n.figure(data))
-    html = render(
-        HERE,
-        "best_of_n.html.j2",
-        figure=picture("Best-of-n: gold and proxy against KL", note, image),
-        table=best_of_n.table(data),
-    )
-    losses = tuple(best_of_n.losses(data))
-    return Section("best-of-n", "Best-of-n over-optimisation", 90, html, "Best-of-n", losses=losses)
+    drawn = best_of_n.picture_of(data)
+    html = render(HERE, "best_of_n.html.j2", figure=picture(drawn), table=best_of_n.table(data))
+    lost, written = tuple(best_of_n.losses(data)), figures.files([drawn])
+    return Section("best-of-n", "Best-of-n over-optimisation", 90, html, "Best-of-n", losses=lost, files=written)
 
 
 def _acquisition() -> list[Section]:
     """Return the study as it was run first, and again with new and more seeds, which say where random is as good."""
-    files = [f"acquisition{run}.json" for run in ("", "-again", "-overlap")]
-    runs = [data for data in map(published.packaged_json, files) if data is not None]
-    note = "Mean over seeds; the band is the interval of asking at random."
+    names = [f"acquisition{run}.json" for run in ("", "-again", "-overlap")]
+    runs = [data for data in map(published.packaged_json, names) if data is not None]
+    drawn = [acquisition.picture_of(data) for data in runs]
     shown = [
         (
             f"Seeds {data['seeds'][0]} to {data['seeds'][-1]}, at most {data['overlap']} raters an item",
-            picture("Regret against answers, by rule", note, figures.data_uri(acquisition.figure(data))),
-            acquisition.losses(data),
+            picture(image),
+            [loss.sentence() for loss in acquisition.losses(data)],
             acquisition.tables(data),
         )
-        for data in runs
+        for data, image in zip(runs, drawn, strict=True)
     ]
     html = render(HERE, "acquisition.html.j2", runs=shown)
-    losses = tuple(loss for data in runs[1:] for loss in acquisition.losses(data))
-    return [Section("acquisition", "Who is asked what", 92, html, losses=losses)]
+    lost = tuple(loss for data in runs[1:] for loss in acquisition.losses(data))
+    return [Section("acquisition", "Who is asked what", 93, html, losses=lost, files=figures.files(drawn))]
 
 
 def _made(store: Store, seeds: int) -> Section:
@@ -191,4 +228,4 @@ def _made(store: Store, seeds: int) -> Section:
         versions={p: metadata.version(p) for p in _PACKAGES} | {"python": platform.python_version()},
         machine=f"{platform.machine()}, {os.cpu_count()} cores",
     )
-    return Section("made", "How this was made", 1000, html, "How it was made")
+    return Section("made", "How this was made", 1000, html, "How it was made", page=_FIRST)

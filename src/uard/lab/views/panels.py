@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import escape
-from matplotlib.figure import Figure
 
 from uard.envs.base import TableEnvironment
 from uard.envs.grids.trapgrid import TrapGrid
@@ -25,15 +24,18 @@ from uard.lab import statistics
 from uard.lab.statistics import Summary
 from uard.lab.studies.panels import FLOOR, ORACLE, OURS, PUBLISHED, Scenario, scenario
 from uard.lab.study import Row, Study
-from uard.lab.views.figures import COLOURS, axes_of, data_uri
+from uard.lab.views import figures
+from uard.lab.views.figures import Chart, Picture
+from uard.lab.views.losses import Loss
 from uard.lab.views.sections import Section
-from uard.lab.views.tables import Table, number
+from uard.lab.views.tables import Cell, Number, Table, number, p_value
 from uard.lab.views.templates import picture, table
 from uard.ratings.panels import KINDS, Panel, composition, kind_of
 
 PerSeed = Callable[[Row, str], np.ndarray]  # a metric of a row, one number per seed
 
 LEAST_SPREAD = 1.0  # reward units; of the development scenarios the smallest spread is 10.9 on grids, 16.4 on MDPs
+MUCH = 0.25  # regret: a quarter of what knowing the true reward is worth
 WORST = 5  # scenarios of ours that are described
 
 
@@ -135,43 +137,67 @@ def rivals(found: Regrets) -> list[Rival]:
     return sorted(made, key=lambda r: r.gap.mean)
 
 
-def losses(found: Regrets) -> list[str]:
-    """Say first where ours is beaten: overall, and for which kinds of panel."""
-    mean = found.regret[OURS].mean()
-    better = [r for r in rivals(found) if r.gap.mean < 0]
-    beaten = [
-        f"{r.name} {found.regret[r.name].mean():.3f} (difference {_interval(r.gap)}, p = {r.corrected:.2g} after Holm)"
-        for r in better
-    ]
-    tasks = found.tasks[0].upper() + found.tasks[1:]
-    head = f"{tasks}, random panels: mean regret of uard {mean:.3f} over {len(found.scenarios)}"
-    said = [f"{head} scenarios; less regret has {'; '.join(beaten) if beaten else 'no other mitigation'}."]
-    worse = []
-    for kind, here in _by(found, lambda s: kind_of_panel(s.panel)).items():
-        ours = found.regret[OURS][here].mean()
+def losses(found: Regrets) -> list[Loss]:
+    """Say where ours is beaten: overall, for which kinds of panel, and in how many scenarios it loses much."""
+    everywhere = np.ones(len(found.scenarios), bool)
+    mine = statistics.summarise(found.regret[OURS])
+    lost = found.regret[OURS] > MUCH
+    share = Loss(
+        "fails",
+        found.tasks,
+        f"loses more than a quarter of what the true reward is worth in {lost.sum()} of {lost.size} scenarios",
+        ours=statistics.summarise(lost.astype(float), "scenarios", True),
+        metric="share of scenarios",
+        note=f"{lost.size} scenarios",
+        why="the table of worst scenarios says who rated there",
+    )
+    said = [share] if lost.any() else []
+    for r in rivals(found):
+        if r.gap.mean < 0:
+            said.append(_less_regret(found, r.name, everywhere, "all panels", mine, r.corrected, len(found.regret) - 1))
+    for kind, here in by_kind_of_panel(found).items():
         name = min(found.regret, key=lambda n: found.regret[n][here].mean())
-        if (least := found.regret[name][here].mean()) < ours:
-            worse.append(f"{kind} ({here.sum()} scenarios): {name} {least:.3f} against {ours:.3f}")
-    if worse:
-        said.append(f"{tasks}, least regret by kind of panel is not uard's: {'; '.join(worse)}.")
+        if name != OURS and found.regret[name][here].mean() < (mine_here := found.regret[OURS][here]).mean():
+            own = statistics.summarise(mine_here)
+            others = [n for n in found.regret if n != OURS]
+            p = [statistics.paired_sign_flip_p(found.regret[n][here] - mine_here) for n in others]
+            corrected = dict(zip(others, statistics.holm(p), strict=True))[name]
+            said.append(
+                _less_regret(found, name, here, f"{kind} ({here.sum()} scenarios)", own, corrected, len(others))
+            )
     return said
+
+
+def _less_regret(found: Regrets, name: str, here: np.ndarray, where: str, ours: Summary, p: float, of: int) -> Loss:
+    return Loss(
+        "beaten" if p < statistics.LEVEL else "no better",
+        found.tasks,
+        f"{name} has less regret on average",
+        where,
+        name,
+        ours,
+        statistics.summarise(found.regret[name][here]),
+        "regret",
+        p,
+        of,
+    )
 
 
 def main_table(found: Regrets) -> Table:
     """Return mean, interval, worst scenario, and the paired difference to ours, corrected for all rivals."""
     against = {r.name: r for r in rivals(found)}
-    rows = []
+    rows: list[tuple[Cell, ...]] = []
     for name, values in sorted(found.regret.items(), key=lambda item: item[1].mean()):
         r, worst = against.get(name), int(values.argmax())
-        gap = ("", "") if r is None else (_interval(r.gap), f"{r.corrected:.2g}")
-        hacks = number(float(found.metrics["hacks"][name].mean())) if "hacks" in found.metrics else ""
-        mean = _interval(statistics.summarise(values))
-        rows.append((name, mean, f"{number(values[worst])} (seed {found.scenarios[worst]})", *gap, hacks))
+        gap = ("", "") if r is None else (_over_scenarios(r.gap, signed=True), p_value(r.corrected))
+        hacks = float(found.metrics["hacks"][name].mean()) if "hacks" in found.metrics else None
+        mean = _over_scenarios(statistics.summarise(values))
+        rows.append((name, mean, *gap, float(values[worst]), str(found.scenarios[worst]), hacks))
     told = sum(r.p < statistics.LEVEL for r in against.values())
     out = f" {len(found.left_out)} more are left out (oracle less than {LEAST_SPREAD:g} above the random walk)."
     return Table(
         f"Regret on {found.tasks}, {len(found.scenarios)} scenarios",
-        ("mitigation", "mean [95 %]", "worst", "more than uard [95 %]", "p (Holm)", "hacks per episode"),
+        ("mitigation", "mean [95 %]", "more than uard [95 %]", "p (Holm)", "worst", "its seed", "hacks per episode"),
         tuple(rows),
         1,
         f"0: as good as learning from the true reward; 1: a random walk. Intervals over scenarios; p of paired "
@@ -185,9 +211,12 @@ def by_kind(found: Regrets) -> Table:
     """Return the mean regret by kind of panel, and by the share of steps that are rated."""
     groups = _by(found, lambda s: kind_of_panel(s.panel)) | _by(found, lambda s: f"{_percent(s.rated)} rated")
     ordered = sorted(found.regret.items(), key=lambda item: item[1].mean())
-    rows = [(name, *(f"{values[here].mean():.3f}" for here in groups.values())) for name, values in ordered]
+    rows = [
+        (name, *(_over_scenarios(statistics.summarise(values[here])) for here in groups.values()))
+        for name, values in ordered
+    ]
     return Table(
-        f"Mean regret on {found.tasks}, by kind of panel and by share of rated steps",
+        f"Mean regret [95 %] on {found.tasks}, by kind of panel and by share of rated steps",
         ("mitigation", *(f"{kind} ({here.sum()})" for kind, here in groups.items())),
         tuple(rows),
         1,
@@ -200,16 +229,16 @@ def worst_table(found: Regrets) -> Table:
     ours = np.argsort(-found.regret[OURS], kind="stable")[:WORST]
     cases = [(OURS, int(i)) for i in ours]
     cases += [(name, int(values.argmax())) for name, values in found.regret.items() if name != OURS]
-    rows = []
+    rows: list[tuple[Cell, ...]] = []
     for name, i in cases:
         drawn = scenario(found.tasks, found.scenarios[i])
         who = f"{composition(drawn.panel)}; {_percent(drawn.rated)} of the steps rated"
-        returns = (number(float(found.metrics["true_return"][n][i])) for n in (name, ORACLE, FLOOR))
-        seed, regret = str(found.scenarios[i]), number(float(found.regret[name][i]))
-        rows.append((name, seed, task_in_words(drawn.environment), who, lost(found, name, i), regret, *returns))
-    columns = ("mitigation", "seed", "task", "panel", "lost", "regret", "true return", "oracle's", "random walk's")
+        returns = (float(found.metrics["true_return"][n][i]) for n in (name, ORACLE, FLOOR))
+        seed, regret = str(found.scenarios[i]), float(found.regret[name][i])
+        rows.append((name, seed, regret, *returns, task_in_words(drawn.environment), who, lost(found, name, i)))
+    columns = ("mitigation", "seed", "regret", "true return", "oracle's", "random walk's", "task", "panel", "lost")
     note = "Per episode, over the last 100; means over seeds."
-    return Table(f"Worst scenarios on {found.tasks}", columns, tuple(rows), 5, note)
+    return Table(f"Worst scenarios on {found.tasks}", columns, tuple(rows), 2, note)
 
 
 def lost(found: Regrets, name: str, i: int) -> str:
@@ -253,20 +282,34 @@ def task_in_words(environment: TableEnvironment) -> str:
     return f"{_percent(float(truth.hack.mean()))} of the state-actions lie: {how}"
 
 
-def figure(found: Sequence[Regrets]) -> Figure:
-    """Draw sorted regrets, a line for each mitigation."""
-    drawn, axes = axes_of(len(found), 5.8)
-    for axis, these in zip(axes, found, strict=True):
-        ordered = sorted(these.regret.items(), key=lambda item: item[1].mean())
-        for name, values in ordered:
-            share = np.arange(1, values.size + 1) / values.size
-            label = f"{name} ({values.mean():.3f})"
-            axis.plot(share, np.sort(values), color=COLOURS.get(name), lw=2.5 if name == OURS else 1.2, label=label)
-        axis.set_yscale("symlog", linthresh=0.1)
-        axis.set(xlabel="share of scenarios", title=f"{these.tasks} ({len(these.scenarios)})")
-        axis.legend(loc="upper left", fontsize=7)
-    axes[0].set_ylabel("regret")
-    return drawn
+STRICT = (1.0, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01)  # regret that is still called solved, less and less
+
+
+def picture_of(found: Sequence[Regrets], seeds: int) -> Picture:
+    """Draw in what share of scenarios each mitigation has at most so much regret.
+
+    Args:
+        found: See ``regrets``.
+        seeds: Of every row.
+    """
+    titles = [f"{these.tasks}, {len(these.scenarios)} scenarios" for these in found]
+    chart = Chart(
+        titles, "solved means: at most this regret", "share of scenarios that are solved", height=4.6, share=True
+    )
+    allowed = np.geomspace(STRICT[0], STRICT[-1], 61)
+    for i, these in enumerate(found):
+        chart.axes[i].set_xscale("log")
+        for name, values in sorted(these.regret.items(), key=lambda item: item[1].mean()):
+            chart.line(i, allowed, [float((values <= most).mean()) for most in allowed], name)
+        chart.axes[i].set(xlim=(STRICT[0], STRICT[-1]), ylim=(0, 1.01))
+        chart.plain(i, STRICT)
+    note = (
+        "See who stays up as the demand rises from left (no worse than a random walk, 1) to right (as good as learning "
+        "from the true reward but for a hundredth). Regret is of means over seeds; a rule is worth its whole line."
+    )
+    return chart.picture(
+        "panels", "In how many scenarios a rule is good enough", note, f"uard reproduce panels --seeds {seeds}"
+    )
 
 
 def tables(found: Sequence[Regrets]) -> list[Table]:
@@ -280,37 +323,43 @@ def headline(found: Sequence[Regrets]) -> str:
     columns = [f"{these.tasks} ({len(these.scenarios)})" for these in found]
     lines = [("mitigation", *columns), ("---",) * (1 + len(found))]
     for name in names:
-        lines.append((f"`{name}`", *(_interval(statistics.summarise(these.regret[name])) for these in found)))
+        means = (_over_scenarios(statistics.summarise(these.regret[name])) for these in found)
+        lines.append((f"`{name}`", *(mean.text(3) for mean in means)))
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def section(study: Study, found: Sequence[Regrets], seeds: int) -> Section:
-    """Return the part of the report: what beats ours first, then tables and a figure.
+    """Return the part of the report: a figure, then tables.
 
     Args:
         study: Of random panels.
         found: See ``regrets``.
         seeds: Of every row.
     """
-    said = tuple(text for these in found for text in losses(these))
-    first = "".join(f"<li>{escape(text)}</li>" for text in said)
     head = (
         f"{study.title}: {seeds} seeds of each mitigation in each scenario. Regret is 0 for an agent that learns from "
         "the true reward, 1 for a random walk."
     )
-    image = picture("Regret over scenarios, sorted", "In brackets means.", data_uri(figure(found)))
-    html = f"<ul>{first}</ul><p>{escape(head)}</p>{image}{''.join(map(table, tables(found)))}"
-    return Section("panels", "Panels that nobody tuned on", 15, html, "Random panels", losses=said)
+    drawn = picture_of(found, seeds)
+    html = f"<p>{escape(head)}</p>{picture(drawn)}{''.join(map(table, tables(found)))}"
+    lost = tuple(loss for these in found for loss in losses(these))
+    written = figures.files([drawn])
+    return Section("panels", "Panels that nobody tuned on", 15, html, "Random panels", losses=lost, files=written)
 
 
-def _interval(s: Summary) -> str:
-    return f"{s.mean:.3f}" + (f" [{s.ci95[0]:.3f}, {s.ci95[1]:.3f}]" if s.ci95 else " (one scenario)")
+def _over_scenarios(s: Summary, signed: bool = False) -> Number:
+    return Number.of_summary(s, of="scenarios", note="one scenario" * (s.ci95 is None), signed=signed)
 
 
 def _by(found: Regrets, group: Callable[[Scenario], str]) -> dict[str, np.ndarray]:
     """Return which scenarios are in which group."""
     groups = np.array([group(scenario(found.tasks, seed)) for seed in found.scenarios])
     return {name: groups == name for name in sorted(set(groups.tolist()))}
+
+
+def by_kind_of_panel(found: Regrets) -> dict[str, np.ndarray]:
+    """Return which scenarios have which kind of panel, by kind."""
+    return _by(found, lambda s: kind_of_panel(s.panel))
 
 
 def _percent(share: float) -> str:

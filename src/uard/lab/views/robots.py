@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from uard.lab.statistics import Family
 from uard.lab.studies import robots
 from uard.lab.study import Row
+from uard.lab.views.losses import Loss, of_family
 from uard.lab.views.published import Published, packaged_json
 from uard.lab.views.sections import Section
-from uard.lab.views.tables import Table, bounds, number
+from uard.lab.views.tables import Table, bounds, number, words
 from uard.lab.views.templates import table
 
 STUDY, NOISE = "robots", "robots-noise"
@@ -86,29 +87,29 @@ def _rivals(p: Published, s: Setting, metric: str) -> tuple[list[Row], Family]:
     return rivals, p.compare([(r, ours) for r in rivals if ours is not None], metric)
 
 
-def _share(p: Published, r: Row, reference: Row | None) -> str:
+def _share(p: Published, r: Row, reference: Row | None) -> str | None:
     """Return the mean true return as a share of a reference's; of means, which need not be of equal seeds."""
     if reference is None:
-        return "–"
+        return None
     whole = p.of(reference, "true_return").mean
-    return f"{100 * p.of(r, 'true_return').mean / whole:.0f} %" if whole > 0 else "–"
+    return f"{100 * p.of(r, 'true_return').mean / whole:.0f} %" if whole > 0 else None
 
 
 def _table(p: Published, s: Setting) -> Table:
     rows = []
     for r in s.rows:
-        hacks = p.of(r, "hacks")
         rows.append(
             (
                 r["mitigation"],
-                f"{number(hacks.mean)}{bounds(hacks.ci95)}",
-                _true(p, r),
+                p.of(r, "hacks"),
+                p.of(r, "true_return"),
                 _share(p, r, s.one("true reward")),
                 _share(p, r, s.plain),
                 str(len(p.seeds_of(r))),
             )
         )
-    columns = ("learns from", "hacks", "true return", "of true reward", "of uncorrupted task", "seeds")
+    shares = ("share of true reward's", "share of uncorrupted task's")
+    columns = ("learns from", "hacks per episode", "true return", *shares, "seeds")
     caption = _rivals(p, s, "true_return")[1].caption() if s.one(OURS) else ""
     note = (
         "Per episode over the last 100 of 200 000 steps, PPO; means [95 %]. Shares of the mean true return of the "
@@ -121,16 +122,20 @@ def _table(p: Published, s: Setting) -> Table:
 def _noise(p: Published) -> list[Table]:
     rows = p.rows(NOISE)
     shares = list(dict.fromkeys(r["noise"] for r in rows))
-    lines = []
-    for name in dict.fromkeys(r["mitigation"] for r in rows):
-        of = {r["noise"]: r for r in rows if r["mitigation"] == name}
-        cells = (_both(p, of.get(x)) for x in shares)
-        lines.append((name, *cells))
-    if not lines:
+    names = list(dict.fromkeys(r["mitigation"] for r in rows))
+    if not rows:
         return []
-    columns = ("learns from", *(f"noise {100 * x:g} %" for x in shares))
-    note = "True return [95 %] (hacks) per episode; noise of every rater as a share of the bonus."
-    return [Table("hopper, a lie about crouch, main panel with more noise", columns, tuple(lines), 1, note)]
+    made = []
+    for metric in ("true_return", "hacks"):
+        lines = []
+        for name in names:
+            of = {r["noise"]: p.of(r, metric) for r in rows if r["mitigation"] == name}
+            lines.append((name, *(of.get(x) for x in shares)))
+        columns = ("learns from", *(f"noise {100 * x:g} %" for x in shares))
+        note = "Per episode; noise of every rater as a share of the bonus."
+        title = f"hopper, a lie about crouch, main panel with more noise: {words(metric)}"
+        made.append(Table(title, columns, tuple(lines), 1, note))
+    return made
 
 
 def headline(p: Published) -> str:
@@ -156,7 +161,7 @@ def _true(p: Published, r: Row) -> str:
     return f"{number(found.mean)}{bounds(found.ci95)}"
 
 
-def losses(p: Published) -> list[str]:
+def losses(p: Published) -> list[Loss]:
     """Say where a simple rule does as well as ``uard``, where a rival does better, and where hacks are left."""
     out = []
     for s in settings(p):
@@ -167,39 +172,37 @@ def losses(p: Published) -> list[str]:
     return out
 
 
-def _beaten(p: Published, s: Setting, ours: Row) -> list[str]:
+def _beaten(p: Published, s: Setting, ours: Row) -> list[Loss]:
     rivals, family = _rivals(p, s, "true_return")
     own = p.of(ours, "true_return")
     out = []
     for i, r in enumerate(rivals):
-        theirs = p.of(r, "true_return")
-        both = f"{number(theirs.mean)}{bounds(theirs.ci95)} against {number(own.mean)}{bounds(own.ci95)}"
+        name = r["mitigation"]
+        against = (name, own, p.of(r, "true_return"), "true return", *of_family(family, i))
         if family.above(i):
-            out.append(f"Robots, {s.name}: {r['mitigation']} earns more than uard, true return {both}.")
-        elif r["mitigation"] in SIMPLE and not family.below(i) and family.tests[i] is not None:
-            out.append(
-                f"Robots, {s.name}: {r['mitigation']} is not told apart from uard, true return {both}; a difference of "
-                f"{number(family.detectable[i])} would have been found."
-            )
+            out.append(Loss("beaten", "robots", f"{name} earns more", s.name, *against))
+        elif name in SIMPLE and not family.below(i) and family.tests[i] is not None:
+            found = f"a difference of {number(family.detectable[i])} would have been found"
+            out.append(Loss("no better", "robots", f"{name} is not told apart", s.name, *against, note=found))
     return out
 
 
-def _left(p: Published, s: Setting, ours: Row) -> list[str]:
+def _left(p: Published, s: Setting, ours: Row) -> list[Loss]:
     """Say where more than a hundredth of the raw agent's hacks are left, and where true return is lost."""
     out = []
     raw, honest = s.one("raw"), s.one("true reward")
     if raw is not None and s.region != "none":
-        left, whole = p.of(ours, "hacks").mean, p.of(raw, "hacks").mean
-        if left > 0.01 * whole:
-            by = "" if honest is None else f"; training on the true reward leaves {number(p.of(honest, 'hacks').mean)}"
-            out.append(f"Robots, {s.name}: {number(left)} of the raw agent's {number(whole)} hacks are left{by}.")
+        left, whole = p.of(ours, "hacks"), p.of(raw, "hacks")
+        if left.mean > 0.01 * whole.mean:
+            what = f"{100 * left.mean / whole.mean:.0f} % of the raw agent's hacks are left"
+            by = "" if honest is None else f"training on the true reward leaves {number(p.of(honest, 'hacks').mean)}"
+            out.append(Loss("fails", "robots", what, s.name, "raw", left, whole, "hacks per episode", why=by))
     reference = honest if s.region != "none" else s.plain
     if reference is not None:
         own, theirs = p.of(ours, "true_return"), p.of(reference, "true_return")
         if own.mean < 0.95 * theirs.mean:
-            who = "the agent on the true reward" if s.region != "none" else "the agent that listens to nobody"
-            out.append(
-                f"Robots, {s.name}: true return {number(own.mean)}{bounds(own.ci95)} is less than 95 % of "
-                f"{number(theirs.mean)}{bounds(theirs.ci95)}, that of {who}."
-            )
+            lies = s.region != "none"
+            who, kind = ("the true reward", "fails") if lies else ("nobody rates", "costs")
+            what = "earns less than 95 % of an agent on the true reward" if lies else "caution costs; nothing lies"
+            out.append(Loss(kind, "robots", what, s.name, who, own, theirs))
     return out

@@ -7,15 +7,21 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from uard import _checks
+from uard.lab.views.losses import Loss
 from uard.lab.views.study_results import StudyResults
 from uard.plugins import Plugin, PluginError, brought
 
-PAGES = ("index.html", "leaderboard.html")  # that stand beside what sections write
+PAGES: Mapping[str, str] = {  # of sections, and what links call them
+    "index.html": "In short",
+    "paper.html": "The paper",
+    "numbers.html": "Every number",
+}
+BOARD = "leaderboard.html"  # is made from a store and has no sections
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the report.
+    """A part of a page of the report.
 
     Examples:
         >>> from markupsafe import escape
@@ -25,17 +31,18 @@ class Section:
 
     Attributes:
         id: Where links lead to: letters, digits and hyphens, as in HTML.
-        title: Its heading.
-        order: Its place: sections are sorted by this number. Ours stand at 20 (where uard loses), 60 (every
-            mitigation), 75 (games), 90 (best-of-n) and 1000 (how the report was made).
+        title: Its heading; none if empty.
+        order: Its place on its page: sections are sorted by this number. Of every number, ours stand at 15 (random
+            panels), 60 (every mitigation), 75 (games), 90 (best-of-n).
         html: What it says below its heading; taken as it is, so text in it must be escaped
             (``uard.lab.views.templates``). What would run in it does not: no ``<script>``, no ``onclick``, no
             ``style`` attributes.
         label: What the navigation calls it; the title if empty.
         css: Rules for it.
         js: A program for it, in a scope of its own. Nothing on the page may be loaded from elsewhere.
-        losses: Where ``uard`` fails or is beaten, in sentences: they stand in the section of that name.
+        losses: Where ``uard`` fails or is beaten: they stand in the table of that name on the first page.
         files: What else is written beside the page: texts by their names.
+        page: On which page it stands, one of ``PAGES``.
     """
 
     id: str
@@ -45,8 +52,9 @@ class Section:
     label: str = ""
     css: str = ""
     js: str = ""
-    losses: tuple[str, ...] = ()
+    losses: tuple[Loss, ...] = ()
     files: Mapping[str, str] = field(default_factory=dict)
+    page: str = "numbers.html"
 
     def __post_init__(self) -> None:
         """Check the fields.
@@ -57,12 +65,16 @@ class Section:
         if not re.fullmatch(r"[a-z][a-z0-9-]*", self.id):
             raise _checks.InvalidValueError("id", self.id, "small letters, digits and hyphens")
         _checks.number("order", self.order)
+        _checks.choose("page", self.page, PAGES)
+        for loss in self.losses:
+            if not isinstance(loss, Loss):  # pyright: ignore[reportUnnecessaryIsInstance]
+                raise _checks.InvalidValueError("losses", loss, "of uard.lab.views.losses.Loss")
         for name, end in (("css", "</style"), ("js", "</script")):
             if end in getattr(self, name).lower():
                 raise _checks.InvalidValueError(name, getattr(self, name), f"without {end}>")
         for name in self.files:
-            if not re.fullmatch(r"\w[\w.-]*", name) or name in PAGES:
-                raise _checks.InvalidValueError("files", name, f"a plain name, none of {', '.join(PAGES)}")
+            if not re.fullmatch(r"\w[\w.-]*", name) or name in (*PAGES, BOARD):
+                raise _checks.InvalidValueError("files", name, f"a plain name, none of {', '.join((*PAGES, BOARD))}")
 
 
 def of_packages(results: StudyResults, ours: Iterable[Section]) -> tuple[list[Section], list[PluginError]]:

@@ -16,6 +16,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
+from uard.lab.views.figures import Picture
 from uard.lab.views.tables import Table
 
 HERE = Path(__file__).parent
@@ -24,8 +25,8 @@ HERE = Path(__file__).parent
 def render(folder: Path, name: str, **values: Any) -> str:
     """Return a template's text with its places filled in.
 
-    A template may use ``show(table)``, ``picture(title, note, image)`` and ``policy(styles, programs)``, which are the
-    functions of this module.
+    A template may use ``show(table)``, ``picture(picture)`` and ``policy(styles, programs)``, which are the functions
+    of this module.
 
     Args:
         folder: Where the template is.
@@ -43,14 +44,23 @@ def _environment(folder: Path) -> jinja2.Environment:
     return environment
 
 
-def table(data: Table) -> Markup:
-    """Return a table as HTML."""
-    return Markup(render(HERE, "table.html.j2", table=data))
+def table(data: Table, id: str = "") -> Markup:
+    """Return a table as HTML.
+
+    Args:
+        data: What it shows.
+        id: Of its figure; made of title and columns if empty.
+    """
+    digest = hashlib.sha256("|".join((data.title, *data.columns)).encode()).hexdigest()
+    shown = data.shown()
+    details = any(cell.details for row in shown for cell in row)
+    name = id or f"table-{digest[:10]}"
+    return Markup(render(HERE, "table.html.j2", table=data, shown=shown, details=details, id=name))
 
 
-def picture(title: str, note: str, image: str) -> Markup:
-    """Return a figure as HTML; ``image`` is a ``data:`` address (``uard.lab.views.figures.data_uri``)."""
-    return Markup(render(HERE, "picture.html.j2", title=title, note=note, image=image))
+def picture(data: Picture) -> Markup:
+    """Return a picture as HTML; its numbers are to be written beside the page (``uard.lab.views.figures.files``)."""
+    return Markup(render(HERE, "picture.html.j2", picture=data))
 
 
 def policy(styles: Iterable[str], programs: Iterable[str]) -> Markup:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from uard.lab.views import published
-from uard.lab.views.figures import data_uri
+from uard.lab.views.figures import files as written
 from uard.lab.views.sections import Section
 from uard.lab.views.study_results import StudyResults
 from uard.lab.views.tables import Table
@@ -21,46 +20,7 @@ from uard.replication.ledger import Entry
 from uard.replication.report import tables, walks
 
 HERE = Path(__file__).parent
-
-FIGURES: tuple[tuple[str, str, Callable[[StudyResults], Figure]], ...] = (  # title, what to see
-    (
-        "G2 · filters",
-        "Left: the three filters. Right: goal rate by form and by where it acts. Acting on J as printed never reaches the goal, whatever the form.",
-        figures.filters,
-    ),
-    (
-        "G3 · the verification delay",
-        "The paper's curve turns to the goal near episode 400. As printed, UARD stays flat near -2; `uard` turns early.",
-        figures.hero,
-    ),
-    (
-        "G4 · trap visits",
-        "Thin lines are seeds, thick ones their mean (moving average over 10 episodes).",
-        figures.hacks,
-    ),
-    (
-        "G5 · the alignment gap",
-        "The baseline's observed and true return part; those of `uard` meet.",
-        figures.alignment_gap,
-    ),
-    ("G8 · true return", "UARD as printed settles at -4: forty steps of -0.1.", figures.true_return),
-    (
-        "G9 · two uncertainties",
-        "Bootstrapped heads. sigma_m at the trap falls after its peak, elsewhere it grows with the values; sigma_h stays. Bands are one SD over seeds.",
-        figures.uncertainty,
-    ),
-    (
-        "G11 on the grid · noisy raters",
-        "The raw agent reads no ratings, so noise cannot hurt it: its line is flat, not rising by 277 %.",
-        figures.noise,
-    ),
-    ("G13 · sign preservation", "Three meanings of one word: equal, smaller, larger.", figures.sign_preservation),
-    (
-        "G16 · observed return of all agents",
-        "A low observed return is no virtue: a random walker has it too.",
-        figures.learning_curves,
-    ),
-)
+PAGE = "paper.html"
 
 
 def sections(results: StudyResults) -> list[Section]:
@@ -74,11 +34,11 @@ def sections(results: StudyResults) -> list[Section]:
     return [
         _short(results, entries, verdicts),
         _walks(results),
-        Section("tables", "The paper's tables beside ours", 40, _shown(tables.tables(results)), "The paper's tables"),
-        Section("figures", "Figures", 50, _figures(results)),
+        Section("tables", "The paper's tables beside ours", 40, _shown(tables.tables(results)), "Tables", page=PAGE),
+        _figures(results),
         _deep(),
         _mujoco(),
-        Section("theory", "Theorem 1", 100, _shown(tables.theory_tables())),
+        Section("theory", "Theorem 1", 100, _shown(tables.theory_tables()), page=PAGE),
         _ledger(results, entries, verdicts),
         _audit(),
     ]
@@ -93,44 +53,60 @@ def _short(results: StudyResults, entries: Sequence[Entry], verdicts: Mapping[st
     html = render(
         HERE, "short.html.j2", headline=headline, claims=len(entries), verdicts=verdicts, version=paper.VERSION
     )
-    return Section("short", "In short", 10, html)
+    return Section("short", "The answer", 10, html, page=PAGE)
 
 
 def _walks(results: StudyResults) -> Section:
     data = json.dumps(walks.walks(results)).replace("<", "\\u003c")  # nothing in it may end the element around it
-    html = render(HERE, "film.html.j2", walks=Markup(data), image=data_uri(figures.walks(results)))
+    drawn = figures.walks(results)
+    html = render(HERE, "film.html.j2", walks=Markup(data), picture_of_walks=drawn)
     css, js = _text("film.css"), _text("film.js")
-    return Section("film", "What the trained agents actually do", 30, html, "What they do", css, js)
+    return Section(
+        "film",
+        "What the trained agents actually do",
+        30,
+        html,
+        "What they do",
+        css,
+        js,
+        files=written([drawn]),
+        page=PAGE,
+    )
 
 
-def _figures(results: StudyResults) -> str:
-    pictures = [(title, note, data_uri(draw(results))) for title, note, draw in FIGURES]
-    return render(HERE, "figures.html.j2", pictures=pictures)
+def _figures(results: StudyResults) -> Section:
+    drawn = [draw(results) for draw in figures.FIGURES]
+    html, title = render(HERE, "figures.html.j2", pictures=drawn), "The paper's figures, drawn again"
+    return Section("figures", title, 50, html, "Figures", files=written(drawn), page=PAGE)
 
 
 def _deep() -> Section:
     results = published.packaged()
-    html = render(HERE, "deep.html.j2", pictures=deep.drawn(results), tables=deep.tables(results))
-    return Section("deep", "Deep agents", 70, html, losses=tuple(deep.losses(results)))
+    drawn = deep.drawn(results)
+    html = render(HERE, "deep.html.j2", pictures=drawn, tables=deep.tables(results))
+    return Section("deep", "Deep agents", 70, html, losses=tuple(deep.losses(results)), files=written(drawn))
 
 
 def _mujoco() -> Section:
     results = published.packaged()
     pictures = [*locomotion.drawn(results), *locomotion.film()]
     html = render(HERE, "mujoco.html.j2", pictures=pictures, tables=locomotion.tables(results))
-    return Section("mujoco", "Hopper and Walker2d", 80, html, "MuJoCo", losses=tuple(locomotion.losses(results)))
+    lost = tuple(locomotion.losses(results))
+    return Section("mujoco", "Hopper and Walker2d", 80, html, "MuJoCo", losses=lost, files=written(pictures))
 
 
 def _ledger(results: StudyResults, entries: Sequence[Entry], verdicts: Mapping[str, int]) -> Section:
     html = render(HERE, "ledger.html.j2", entries=entries, verdicts=verdicts, version=paper.VERSION)
     data = json.dumps(ledger.as_data(entries, results.seeds), indent=2, allow_nan=False) + "\n"
-    css, js = _text("ledger.css"), _text("ledger.js")
-    return Section("ledger", "Ledger of claims", 110, html, "Ledger", css, js, files={"ledger.json": data})
+    css = _text("ledger.css")
+    return Section("ledger", "Ledger of claims", 20, html, "Ledger", css, files={"ledger.json": data}, page=PAGE)
 
 
 def _audit() -> Section:
     html = render(HERE, "audit.html.j2", checks=[_check(c) for c in audit.run()])
-    return Section("audit", "The paper's arithmetic, recomputed", 120, html, "Arithmetic", _text("audit.css"))
+    return Section(
+        "audit", "The paper's arithmetic, recomputed", 120, html, "Arithmetic", _text("audit.css"), page=PAGE
+    )
 
 
 def _check(c: audit.Check) -> dict[str, str]:

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from uard.lab.views.study_results import StudyResults
-from uard.lab.views.tables import Table, brief, full, number
+from uard.lab.views.tables import Cell, Number, Table
 from uard.replication import paper, theory
 
 
-def headline(results: StudyResults) -> list[dict[str, str]]:
+def headline(results: StudyResults) -> Table:
     """Return the four agents on 10x10 at the paper's T = 80, both panels: what a reader must see first."""
-    rows = []
+    rows: list[tuple[Cell, ...]] = []
     for agent in ("baseline", "random walk", "uard-paper", "uard-consistent", "uard-0.1", "uard"):
         for panel in ("main", "appendix"):
-            if agent in ("baseline", "random walk") and panel == "appendix":
+            alone = agent in ("baseline", "random walk")
+            if alone and panel == "appendix":
                 continue
-            get = [
-                results.get("scale", m, agent=agent, size=10, panel=panel)
-                for m in ("hacks", "success_rate", "true_return")
-            ]
-            name = agent if agent in ("baseline", "random walk") else f"{agent}, {panel} panel"
-            rows.append({"agent": name, "visits": full(get[0]), "goal": full(get[1]), "true": full(get[2])})
-    return rows
+            metrics = ("hacks", "success_rate", "true_return")
+            got = (results.get("scale", m, agent=agent, size=10, panel=panel) for m in metrics)
+            rows.append((agent, "–" if alone else panel, *got))
+    columns = ("agent", "panel", "trap visits per episode", "goal rate", "true return")
+    return Table("10x10 grid, three traps of +4, T = 80", columns, tuple(rows), 2, "Mean [95 % interval] over seeds.")
 
 
 def tables(results: StudyResults) -> list[Table]:
@@ -39,9 +38,7 @@ def _table2(results: StudyResults) -> Table:
             results.get("scale", "hacks", agent=a, size=p.size, panel="main")
             for a in ("uard-paper", "uard", "baseline")
         ]
-        rows.append(
-            (f"{p.size}x{p.size}", _stat(p.uard), full(ours[0]), full(ours[1]), _stat(p.baseline), full(ours[2]))
-        )
+        rows.append((f"{p.size}x{p.size}", _stat(p.uard), ours[0], ours[1], _stat(p.baseline), ours[2]))
     return Table(
         "Table 2 (F2): trap visits by grid",
         ("grid", "paper: UARD", "ours: uard-paper", "ours: uard", "paper: baseline", "ours: baseline"),
@@ -52,20 +49,20 @@ def _table2(results: StudyResults) -> Table:
 
 
 def _table3(results: StudyResults) -> Table:
-    rows = [
-        (p.method, "paper", _stat(p.reward), _stat(p.visits), "–", "–", f"{p.reduction:g} %") for p in paper.TABLE_3
+    rows: list[tuple[Cell, ...]] = [
+        (p.method, "paper", _stat(p.reward), _stat(p.visits), None, None, p.reduction) for p in paper.TABLE_3
     ]
     for t in (100, 80):
         base = results.get("table3", "hacks", agent="baseline", horizon=t, panel="main")
         for agent in ("baseline", "uard-paper", "uard-consistent", "uard-0.1", "uard", "random walk"):
             r = results.row("table3", agent=agent, horizon=t, panel="main")
             v, o, g, true = (results.of(r.cell, m) for m in ("hacks", "observed_return", "success_rate", "true_return"))
-            cut = f"{100 * (1 - v.mean / base.mean):.1f} %"
-            total = f"{number(100 * v.mean)} ± {number(100 * v.sd)}"
-            rows.append((agent, f"ours, T = {t}", brief(o), total, brief(g), brief(true), cut))
+            cut = 100 * (1 - v.mean / base.mean)
+            total = Number.of_summary(v, scale=paper.LAST_EPISODES)
+            rows.append((agent, f"ours, T = {t}", o, total, g, true, cut))
     return Table(
         "Table 3 (F3): 10x10, last 100 episodes",
-        ("method", "source", "mean reward", "trap visits (total)", "goal rate", "true return", "reduction"),
+        ("method", "source", "mean reward", "trap visits (total)", "goal rate", "true return", "reduction, %"),
         tuple(rows),
         2,
         "Our baseline here is tabular Q-learning, main panel; deep ones stand in a section of their own. Note the random walk.",
@@ -74,10 +71,10 @@ def _table3(results: StudyResults) -> Table:
 
 def _table4(results: StudyResults) -> Table:
     names = {"Baseline": "baseline", "Multi-Head": "multi-head", "UARD": "uard-paper"}
-    rows = []
+    rows: list[tuple[Cell, ...]] = []
     for p in paper.TABLE_4:
         rows.append(
-            (p.agent, "paper", _stat(p.true_return), _stat(p.observed_return), _stat(p.visits), _stat(p.gap), "–")
+            (p.agent, "paper", _stat(p.true_return), _stat(p.observed_return), _stat(p.visits), _stat(p.gap), None)
         )
         for panel in ("main", "appendix"):
             rows.append(_row4(results, names[p.agent], panel))
@@ -92,10 +89,10 @@ def _table4(results: StudyResults) -> Table:
     )
 
 
-def _row4(results: StudyResults, agent: str, panel: str) -> tuple[str, ...]:
+def _row4(results: StudyResults, agent: str, panel: str) -> tuple[Cell, ...]:
     r = results.row("table4", agent=agent, panel=panel)
     metrics = ("true_return", "observed_return", "hacks", "alignment_gap", "success_rate")
-    return (agent, f"ours, {panel}", *(full(results.of(r.cell, m)) for m in metrics))
+    return (agent, f"ours, {panel}", *(results.of(r.cell, m) for m in metrics))
 
 
 def _table5(results: StudyResults) -> Table:
@@ -106,20 +103,29 @@ def _table5(results: StudyResults) -> Table:
         "Human-only": "No sigma_m (Human-only)",
         "UARD": "UARD (Full)",
     }
+    readings = {
+        "uard-paper": "as printed (acts on J)",
+        "uard-consistent": "consistent backup",
+        "uard-operator": "T_lambda (on the reward)",
+        "uard-0.1": "ours (uard-0.1)",
+    }
     for p in paper.TABLE_5:
         name = variant.get(p.variant, p.variant)
-        cells = []
-        for reading in ("uard-paper", "uard-consistent", "uard-operator", "uard-0.1"):
-            found = list(results.studies["table5"].where(variant=name, reading=reading if p.discounting else "-"))
-            v, g = results.of(found[0].cell, "hacks"), results.of(found[0].cell, "success_rate")
-            cells.append(f"{brief(v)} (goal {g.mean:.2f})")
-        rows.append((p.variant, _stat(p.visits), *cells))
+        found = [
+            next(iter(results.studies["table5"].where(variant=name, reading=reading if p.discounting else "-"))).cell
+            for reading in readings
+        ]
+        visits, goals = ([results.of(cell, m) for cell in found] for m in ("hacks", "success_rate"))
+        rows.append((p.variant, _stat(p.visits), *(x for pair in zip(visits, goals, strict=True) for x in pair)))
+    heads = (f"{what}: {label}" for label in readings.values() for what in ("visits", "goal rate"))
     return Table(
         "Table 5 (F5): which component does the work",
-        ("variant", "paper", "as printed (acts on J)", "consistent backup", "T_lambda (on reward)", "ours (uard-0.1)"),
+        ("variant", "paper: visits", *heads),
         tuple(rows),
         1,
-        "Trap visits per episode, 6x6, main panel, heads bootstrapped with probability 0.5. Without sigma_h no reading of the paper works. Ours then still has its anchor and lambda_t, which come from the ratings too.",
+        "Trap visits per episode and share of episodes that reach the goal, 6x6, main panel, heads bootstrapped with "
+        "probability 0.5. Without sigma_h no reading of the paper works. Ours then still has its anchor and lambda_t, "
+        "which come from the ratings too.",
     )
 
 
@@ -130,7 +136,7 @@ def theory_tables() -> list[Table]:
             f"{t.size}x{t.size}",
             f"{t.trap:+g}",
             t.panel,
-            "none" if t.critical is None else number(t.critical),
+            "none" if t.critical is None else Number(t.critical),
             "yes" if t.critical is None or t.critical > 2 else "no",
         )
         for t in theory.critical_lambdas()
