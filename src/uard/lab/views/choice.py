@@ -49,6 +49,10 @@ TOO_MUCH = 0.25  # regret of the best rule from which on no rule is called enoug
 class Choice:
     """What to use for one kind of panel.
 
+    Examples:
+        >>> one.best_regret.mean, one.simplest_regret.ci95
+        (0.0, (0.0, 0.0))
+
     Attributes:
         kind: Of panel.
         scenarios: How many there are.
@@ -75,6 +79,11 @@ class Choice:
 def choices(found: Regrets, groups: Mapping[str, np.ndarray] | None = None) -> list[Choice]:
     """Return what is enough, for each kind of panel.
 
+    Examples:
+        >>> every = {"all panels": np.ones(20, bool)}
+        >>> [(c.kind, c.scenarios, c.simplest, c.best) for c in choices(found, every)]
+        [('all panels', 20, 'worst-of-annotations', 'worst-of-annotations')]
+
     Args:
         found: Regrets on one kind of tasks, see ``panels.regrets``.
         groups: Which scenarios are of which kind, by name; by default by kind of panel.
@@ -83,13 +92,22 @@ def choices(found: Regrets, groups: Mapping[str, np.ndarray] | None = None) -> l
 
 
 def by_kind(found: Regrets) -> dict[str, np.ndarray]:
-    """Return which scenarios have which kind of panel (``panels.kind_of_panel``), by kind."""
+    """Return which scenarios have which kind of panel (``panels.kind_of_panel``), by kind.
+
+    Examples:
+        >>> {kind: int(here.sum()) for kind, here in by_kind(found).items() if kind != "some tempted"}
+        {'all truthful': 2, 'one rater': 2, 'some answering at random': 6, 'some repeating the proxy': 9}
+    """
     kinds = np.array([kind_of_panel(scenario(found.tasks, seed).panel) for seed in found.scenarios])
     return {str(kind): kinds == kind for kind in np.unique(kinds)}
 
 
 def by_share_rated(found: Regrets) -> dict[str, np.ndarray]:
     """Return which scenarios have which share of their steps rated, the fullest first; another grouping of ``choices``.
+
+    Examples:
+        >>> [int(here.sum()) for here in by_share_rated(found).values()], list(by_share_rated(found))[0]
+        ([10, 1, 4, 5], '100 % of the steps rated')
 
     Args:
         found: Regrets on random tasks, whose scenarios are drawn again to look.
