@@ -21,6 +21,10 @@ for (const table of document.querySelectorAll("table.sortable")) {
     };
   });
 }
+const closed = () => [...document.querySelectorAll("details:not([open])")];
+let opened = [];
+addEventListener("beforeprint", () => { opened = closed(); for (const d of opened) d.open = true; });
+addEventListener("afterprint", () => { for (const d of opened) d.open = false; });
 for (const filters of document.querySelectorAll(".filters")) {
   const bodies = [...document.querySelectorAll(filters.dataset.for)].map(table => table.tBodies[0]);
   const count = filters.querySelector(".count"), all = filters.querySelector("button.all");
