@@ -61,6 +61,16 @@ def test_every_line_is_named_at_its_end():
     assert {"uard", "raw"} <= {text.get_text() for text in picture().figure.axes[0].texts}
 
 
+def test_the_names_stand_in_the_order_of_the_ends():
+    made = Chart([""], "x", "y")
+    for name, end in (("dqn", 100.0), ("cql", 1.0), ("ppo", 99.0), ("sac", 50.0)):
+        made.line(0, [0, 1], [0.0, end], name)
+    (axis,) = made.picture("order", "T", "See.", "none").figure.axes
+    place = {text.get_text(): text.xy[1] for text in axis.texts}
+    assert sorted(place, key=place.get) == ["cql", "sac", "ppo", "dqn"]
+    assert place["sac"] == pytest.approx((50 - axis.get_ylim()[0]) / np.ptp(axis.get_ylim()))
+
+
 def test_an_svg_refers_to_nothing_and_runs_nothing():
     text = svg_of(picture())
     ET.fromstring(text)

@@ -18,7 +18,7 @@ from uard.lab.study import Study, row
 from uard.lab.views.losses import Loss
 from uard.lab.views.sections import Section
 from uard.lab.views.study_results import StudyResults
-from uard.lab.views.tables import Table, full
+from uard.lab.views.tables import Table
 from uard.lab.views.templates import table
 from uard.method.mitigations import Raw, named
 
@@ -129,7 +129,7 @@ def studies() -> dict[str, tuple[Study, ...]]:
 def sections(results: StudyResults) -> list[Section]:
     """Return what joins the report; ``evidence`` holds all studies of the group ``grid``."""
     (walker, *_) = results.studies["control"].rows
-    rows = (("a random walker, 6x6", full(results.of(walker.cell, "hacks"))),)
+    rows = (("a random walker, 6x6", results.of(walker.cell, "hacks")),)
     shown = table(Table("What nobody has to learn", ("who", "trap visits per episode"), rows))
     lost = Loss("fails", "bells", "nobody has tried uard on bells of 1000")
     return [Section("example", "An example", 250, shown, losses=(lost,))]

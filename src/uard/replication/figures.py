@@ -105,9 +105,9 @@ def hero(results: StudyResults) -> Picture:
 def hacks(results: StudyResults) -> Picture:
     """G4: trap visits per episode."""
     chart = _training(results, "hacks", ("baseline", "multi-head", "uard-paper", "uard"), "trap visits per episode")
-    (printed,) = (row for row in paper.TABLE_4 if row.agent == "Baseline")
+    most = paper.FIGURES["G4"].number("baseline up to")
     for i in range(2):
-        chart.reference(i, printed.visits.mean, f"{printed.visits.mean:g} in the paper", at=0.3)
+        chart.reference(i, most, f"up to {most:g} in the paper", at=0.5)
         chart.reference(i, SETTLED, "none from here on, in the paper", "x", at=0.35)
         chart.axes[i].set(ylim=(-0.5, None))
     return chart.picture(
@@ -123,7 +123,6 @@ def alignment_gap(results: StudyResults) -> Picture:
     """G5: observed and true return of the baseline drift apart; of ``uard`` they do not."""
     agents = ("baseline", "uard")
     chart = Chart([f"{agent}, 6x6, main panel" for agent in agents], "episode", "return per episode", share=True)
-    (printed,) = (row for row in paper.TABLE_4 if row.agent == "Baseline")
     for i, agent in enumerate(agents):
         for column, name, how in (
             ("observed_return", "observed", Look("blue", width=2.0)),
@@ -131,8 +130,10 @@ def alignment_gap(results: StudyResults) -> Picture:
         ):
             _curves(chart, i, results.curves("table4", column, agent=agent, panel="main"), name, how)
         chart.axes[i].set(xlim=(0, paper.EPISODES))
-    for value, what in ((printed.observed_return.mean, "observed"), (printed.true_return.mean, "true")):
-        chart.reference(0, value, f"{what}: {value:g} in the paper", at=0.05)
+    above, (low, high) = paper.FIGURES["G5"].number("observed above"), paper.FIGURES["G5"].range("baseline true")
+    chart.reference(0, above, f"observed: above {above:g} in the paper", at=0.02)
+    chart.reference(0, low, "", at=0.02)
+    chart.reference(0, high, f"true: {low:g} to {high:g} in the paper", at=0.3)
     return chart.picture(
         "g5",
         "G5 · the alignment gap",
@@ -146,13 +147,14 @@ def true_return(results: StudyResults) -> Picture:
     """G8: true return against episode."""
     agents = ("baseline", "multi-head", "uard-paper", "uard")
     chart = _training(results, "true_return", agents, "true return per episode")
-    (printed,) = (row for row in paper.TABLE_4 if row.agent == "UARD")
+    printed, (lowest, _) = paper.FIGURES["G8"].number("UARD"), paper.FIGURES["G8"].range("baseline")
     for i in range(2):
-        chart.reference(i, printed.true_return.mean, f"UARD: {printed.true_return.mean:g} in the paper", at=0.4)
+        chart.reference(i, printed, f"UARD: {printed:g} in the paper", at=0.4)
+        chart.reference(i, lowest, f"baseline: down to {lowest:g} in the paper", at=0.02)
     return chart.picture(
         "g8",
         "G8 · true return",
-        f"See that UARD as printed (uard-paper) ends where the paper says, at {printed.true_return.mean:g}: that is forty "
+        f"See that UARD as printed (uard-paper) ends where the paper says, at {printed:g}: that is forty "
         f"steps of -0.1, an episode without the goal. {BANDS}",
         _command(results, "table4"),
     )
@@ -203,12 +205,15 @@ def noise(results: StudyResults) -> Picture:
             s = [results.get("noise", "hacks", agent=agent, panel="main", percent=p, unit=unit) for p in levels]
             mean, low, high = ends_of(s)
             chart.line(i, levels, mean, agent, low, high, markers=True)
+        for who, how in (("baseline", Look("grey", DASHED)), ("UARD", Look("grey", DOTTED))):
+            ends = (paper.FIGURES["G11"].stat(f"{who} at {percent}").mean for percent in (0, 30))
+            chart.line(i, [0, 30], list(ends), f"paper: {who}", look_of=how)
         chart.plain(i, [0, 10, 20, 30])
     return chart.picture(
         "g11",
         "G11 on the grid · noisy raters",
         "See that the raw agent (baseline) reads no ratings, so noise cannot hurt it: its line is flat, where the paper's "
-        "rises by 277 %. Points are means over seeds, bands 95 % intervals.",
+        "(grey: its first and last point, of an unnamed task) rises by 277 %. Points are means over seeds, bands 95 % intervals.",
         _command(results, "noise"),
     )
 
@@ -353,10 +358,10 @@ def hacking_region(trace: np.ndarray, windows: Sequence[tuple[int, int]]) -> Cha
     return chart
 
 
-def over_training(curves: dict[str, np.ndarray], steps: int, target: float) -> Chart:
+def over_training(curves: dict[str, np.ndarray], steps: int, printed: Sequence[float]) -> Chart:
     """G6, G7: returns and hacks over a training of so many steps; of each agent (seeds, parts, columns).
 
-    The columns are those of ``studies.derive.LEARNED``; ``target`` is the return that the paper calls aligned.
+    The columns are those of ``studies.derive.LEARNED``; ``printed`` are returns that the paper names.
     """
     labels = {"observed_return": "observed return", "true_return": "true return", "hacks": "steps in the region"}
     chart = Chart(
@@ -367,7 +372,8 @@ def over_training(curves: dict[str, np.ndarray], steps: int, target: float) -> C
             x = (np.arange(found.shape[1]) + 0.5) * steps / found.shape[1] / 1000
             _interval(chart, i, x, found[..., derive.LEARNED.index(column)], agent)
         if column != "hacks":
-            chart.reference(i, target, f"{target:g}", at=0.9)
+            for value in printed:
+                chart.reference(i, value, f"{value:g}" if column == "true_return" else "", at=0.9)
         if column == "hacks":
             chart.axes[i].set(ylim=(0, None))
     return chart

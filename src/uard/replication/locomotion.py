@@ -579,23 +579,27 @@ def _command(p: Published, study: str) -> str:
     return made_by(p.sources, study, f"uard reproduce {study} --seeds {seeds}")
 
 
-TARGETS = {"hopper": ("G6", "Hopper objective"), "walker2d": ("G7", "Walker2d objective")}
+FIGURES = {
+    "hopper": ("G6", ("target",)),
+    "walker2d": ("G7", ("UARD", "baselines")),
+}  # and what the paper prints of them
 
 
 def _over_training(p: Published) -> list[Picture]:
     made = []
-    for robot, (name, objective) in TARGETS.items():
+    for robot, (name, what) in FIGURES.items():
         rows = drifting(p, robot=robot)
         curves = {r["mitigation"]: p.derived(r, "learning") for r in rows}
         if curves:
-            target = paper.TEXT[objective].value
+            printed = {label: paper.FIGURES[name].number(label) for label in what}
             note = (
                 "See whether the observed return rises while the true one falls: that would be the drift that the paper "
                 f"shows. PPO, vibration, main panel, {_budget(p, drifting(p))}. Lines are means over seeds of the episodes "
-                "that ended in each twentieth of the training, bands their 95 % intervals. Dotted: the paper's objective "
-                f"of {target:g}, which is a fall."
+                "that ended in each twentieth of the training, bands their 95 % intervals. Dotted, of the paper: "
+                + ", ".join(f"{label} {value:g}" for label, value in printed.items())
+                + "."
             )
-            chart = figures.over_training(curves, rows[0].cell.steps or 0, target)
+            chart = figures.over_training(curves, rows[0].cell.steps or 0, list(printed.values()))
             title = f"{name} · {robot} over its training"
             made.append(chart.picture(f"{name.lower()}-{robot}-training", title, note, _command(p, DRIFT)))
     rows = drifting(p, robot="hopper")

@@ -369,10 +369,7 @@ class Chart:
 
     def key(self, names: Mapping[str, Look], columns: int = 0) -> None:
         """Draw a legend above all panels, for what no line's end can name."""
-        lines = [
-            Line2D([], [], color=how.light, ls=how.dash, lw=max(how.width, 1.8))
-            for how in names.values()
-        ]
+        lines = [Line2D([], [], color=how.light, ls=how.dash, lw=max(how.width, 1.8)) for how in names.values()]
         with matplotlib.rc_context(_STYLE):
             self.figure.legend(
                 lines, list(names), loc="outside upper left", ncols=columns or len(names), frameon=False, fontsize=9.0
@@ -395,6 +392,9 @@ class Chart:
         room = 96 * self.height - 70  # px that title, ticks and label leave of a row
         for panel, ends in self._ends.items():
             axis = self.axes[panel]
+            axis.set(
+                xlim=axis.get_xlim(), ylim=axis.get_ylim()
+            )  # a transform knows its limits only once they are asked for
             drawn = [axis.transLimits.transform(axis.transScale.transform((x, y))) for x, y, *_ in ends]
             edges = [min(max(float(y), 0.0), 1.0) for _, y in drawn]
             places = apart(edges, _LINE / room)
