@@ -17,7 +17,7 @@ from uard.envs.tables import HiddenTruth, Task
 from uard.method.abstention import Abstention
 from uard.method.mitigations import NAMED, named
 from uard.ratings.panels import PANELS, RatingLaw
-from uard.training.compiled import runs
+from uard.training.compiled import draws, runs
 from uard.training.compiled import tabular as compiled
 from uard.training.compiled.tabular import Program, Run, TrainedTables
 from uard.training.episode_log import LOG
@@ -260,10 +260,17 @@ def test_random_bits_become_finite_normals():
     bits = np.arange(2**16, dtype=np.uint32) << 16 | 1 << 15
     ends = np.uint32([0, 2**32 - 1])
     exact = scipy.stats.norm.ppf((bits + 0.5) / 2**32)
-    np.testing.assert_allclose(compiled._normal(bits), exact, atol=2e-3)
-    low, high = np.asarray(compiled._normal(ends))
+    np.testing.assert_allclose(draws.normal(bits), exact, atol=2e-3)
+    low, high = np.asarray(draws.normal(ends))
     assert -6 < low < -5
     assert 5 < high < 6
+
+
+@pytest.mark.parametrize(("seed", "number", "count", "steps"), [(0, 0, 1, 1), (7, 3, 5, 512), (2**32 - 1, 2, 4, 9)])
+def test_random_bits_are_threefry(seed: int, number: int, count: int, steps: int):
+    key = jax.random.wrap_key_data(np.uint32([seed, number]), impl="threefry2x32")
+    found = draws.words(np.uint32(seed), np.uint32(number), count, steps)
+    np.testing.assert_array_equal(found.T, jax.random.bits(key, (steps, count), np.uint32))
 
 
 def test_a_share_of_the_steps_is_rated():
@@ -309,4 +316,4 @@ def test_who_plays_safe_acts_otherwise():
 
 def test_no_draw_of_a_rater_is_infinite():
     extremes = np.array([0, 2**32 - 1, 2**31, 2**32 - 256], np.uint32)
-    assert np.isfinite(np.asarray(compiled._normal(extremes))).all()
+    assert np.isfinite(np.asarray(draws.normal(extremes))).all()

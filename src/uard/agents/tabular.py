@@ -102,12 +102,12 @@ def words(agent: QLearning) -> int:
 
 
 def draw(agent: QLearning, bits: Array, actions: int) -> Draws:
-    """Turn (C, words) random bits into the draws of C steps."""
-    shifts = 8 * (jnp.arange(agent.heads, dtype=jnp.uint32) % 4)
-    bytes_ = (bits[:, 1:][:, jnp.arange(agent.heads) // 4] >> shifts) & 255
+    """Turn (words, C) random bits into the draws of C steps."""
+    heads = jnp.arange(agent.heads)
+    bytes_ = (bits[1:][heads // 4] >> (8 * (heads % 4).astype(jnp.uint32))[:, None]) & 255
     chosen = bytes_.astype(jnp.float32) < agent.bootstrap * 256.0
-    action = (((bits[:, 0] & 255) * actions) >> 8).astype(jnp.int32)  # the eight bits that ``uniform`` leaves
-    return Draws(uniform(bits[:, 0]), action, chosen.astype(jnp.float32))
+    action = (((bits[0] & 255) * actions) >> 8).astype(jnp.int32)  # the eight bits that ``uniform`` leaves
+    return Draws(uniform(bits[0]), action, chosen.astype(jnp.float32).T)
 
 
 def mean_and_deviation(q: Array) -> tuple[Array, Array]:

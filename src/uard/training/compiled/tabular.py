@@ -21,6 +21,7 @@ from uard.method.mitigations import Evidence, LearningSignal, Mitigation
 from uard.ratings.aggregate import aggregate, empty_rows, from_rows, merged, to_rows
 from uard.ratings.panels import UNIFORMS, RatingLaw, answers
 from uard.training.compiled import runs
+from uard.training.compiled.draws import normal, words
 from uard.training.episode_log import LOG
 from uard.training.tracing import traceable
 
@@ -313,36 +314,12 @@ def _drawn(run: Run, number: Array, actions: int, raters: int | None) -> _Draws:
     own = tabular.words(run.agent)
     quirky = raters is not None and run.law.quirks is not None
     asked = 0 if raters is None else raters * (1 + UNIFORMS * quirky) + 1
-    bits = jax.random.bits(_key(run.seed, number), (CHUNK, own + asked), jnp.uint32)
-    agent = tabular.draw(run.agent, bits[:, :own], actions)
+    bits = words(run.seed, number, own + asked, CHUNK)
+    agent = tabular.draw(run.agent, bits[:own], actions)
     if raters is None:
         return _Draws(agent, jnp.zeros((CHUNK, 0)), None, jnp.zeros((CHUNK, 0)))
-    normal = _normal(bits[:, own : own + raters])
-    uniform = tabular.uniform(bits[:, own + raters : -1]).reshape(CHUNK, raters, UNIFORMS) if quirky else None
-    return _Draws(agent, normal, uniform, (tabular.uniform(bits[:, -1]) < run.rated).astype(jnp.float32))
-
-
-# Giles' single-precision polynomials for the inverse error function, near the centre and in the tails.
-_CENTRE = (
-    2.81022636e-08, 3.43273939e-07, -3.5233877e-06, -4.39150654e-06, 0.00021858087, -0.00125372503, -0.00417768164,
-    0.246640727, 1.50140941,
-)  # fmt: skip
-_TAIL = (
-    -0.000200214257, 0.000100950558, 0.00134934322, -0.00367342844, 0.00573950773, -0.0076224613, 0.00943887047,
-    1.00167406, 2.83297682,
-)  # fmt: skip
-
-
-def _normal(bits: Array) -> Array:
-    """Turn 32 random bits into a standard normal, never beyond +-5.3, by the inverse of its distribution function.
-
-    The probability keeps 23 bits and lies in the middle of its interval, so that it never rounds to 0 or 1.
-    """
-    p = ((bits >> 9).astype(jnp.float32) + jnp.float32(0.5)) * jnp.float32(2.0**-23)
-    w = -jnp.log(4.0 * p * (1.0 - p))
-    tail = w >= 5.0
-    w = jnp.where(tail, jnp.sqrt(w) - 3.0, w - 2.5)
-    y = jnp.zeros_like(w)
-    for centre, far in zip(_CENTRE, _TAIL, strict=True):
-        y = y * w + jnp.where(tail, jnp.float32(far), jnp.float32(centre))
-    return jnp.float32(np.sqrt(2.0)) * y * (2.0 * p - 1.0)
+    uniform = None
+    if quirky:
+        uniform = tabular.uniform(bits[own + raters : -1]).reshape(raters, UNIFORMS, CHUNK).transpose(2, 0, 1)
+    rated = (tabular.uniform(bits[-1]) < run.rated).astype(jnp.float32)
+    return _Draws(agent, normal(bits[own : own + raters]).T, uniform, rated)
