@@ -2,10 +2,12 @@
 
 import json
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -58,6 +60,29 @@ def test_people_rate_while_an_agent_trains(tmp_path: Path) -> None:
     assert numbers["ratings"] > 300
     assert numbers["goal_rate"] > 0.9
     assert numbers["hacks"] < 3  # without ratings it hacks 17 times
+
+
+def test_ten_minutes_does_what_its_page_says(tmp_path: Path) -> None:
+    printed = run("ten_minutes.py", tmp_path)
+    page = (EXAMPLES.parent / "docs" / "ten-minutes.md").read_text()
+    shown = page.split("<!-- numbers: ten-minutes -->")[1].split("```")[1].removeprefix("text")
+    number = re.compile(r"-?\d+(?:\.\d+)?")
+    assert number.sub("x", printed).split() == number.sub("x", shown).split()
+    for ours, theirs in zip(number.findall(printed), number.findall(shown), strict=True):
+        # What another processor's arithmetic may change: which of two equal actions is taken.
+        assert float(ours) == pytest.approx(float(theirs), rel=0.2, abs=0.5)
+    without, with_it = (list(map(float, number.findall(line))) for line in printed.splitlines()[:2])
+    assert without[0] > with_it[0] > with_it[1] > 0 > without[1]  # paid less, worth more
+    assert without[2] > 10 > 2 > with_it[2]
+
+
+def test_ten_minutes_is_no_matter_of_the_seed() -> None:
+    found = runpy.run_path(str(EXAMPLES / "ten_minutes.py"))
+    for seed in range(1, 4):
+        filtered = found["ReliabilityWrapper"](
+            found["Corridor"](), ratings=found["people"](np.random.default_rng(seed))
+        )
+        assert found["learn"](found["Corridor"](), seed)[1] < 0 < 5 < found["learn"](filtered, seed)[1]
 
 
 @pytest.mark.parametrize("name", sorted(p.name for p in EXAMPLES.glob("*.py")))

@@ -245,7 +245,7 @@ variances = st.floats(0.01, 10)
 @settings(max_examples=300)
 @given(said_of_it, variances, st.integers(1, 20))
 def test_equally_exact_raters_who_say_the_reward_never_lower_the_weight(said, variance, more):
-    """Whatever the others say; docs/pooled.md proves it."""
+    """Whatever the others say; docs/method.md proves it."""
     before, after = (odds_at_zero(x, [variance] * len(x)) for x in (said, [*said, *[0.0] * more]))
     assert after <= before + 1e-9
 
