@@ -11,7 +11,7 @@ import numpy as np
 
 from uard import _checks
 from uard.method import uncertainty
-from uard.method.arrays import Array, as_floats, namespace
+from uard.method.arrays import Array, as_floats, at_least, dot, filled_like, least, namespace, total
 from uard.method.feedback import ByRater, Feedback
 
 if TYPE_CHECKING:
@@ -67,16 +67,16 @@ def aggregate(
 
 
 def _complete(ratings: Float[Array, "*batch K"], proxy: Float[Array, "*batch"], ddof: int) -> Feedback:
-    xp, raters = namespace(ratings), ratings.shape[-1]
-    mean = ratings.sum(-1) / raters  # the method, not xp.sum, for speed: streams of one step live here
-    one = xp.ones_like(mean)
+    raters = ratings.shape[-1]
+    mean = total(ratings) / raters
+    one = filled_like(mean, 1.0)
     if raters > max(ddof, 1):
         gap = ratings - mean[..., None]
-        sd = uncertainty.root((gap * gap).sum(-1) / (raters - ddof))
+        sd = uncertainty.root(dot(gap, gap) / (raters - ddof))
     else:
         sd = 0.0 * one
-    by_rater = ByRater(xp.ones_like(ratings), ratings, xp.zeros_like(ratings))
-    return Feedback(one, mean, xp.min(ratings, axis=-1), sd, proxy, raters * one, by_rater)
+    by_rater = ByRater(filled_like(ratings, 1.0), ratings, filled_like(ratings, 0.0))
+    return Feedback(one, mean, least(ratings), sd, proxy, raters * one, by_rater)
 
 
 def _masked(
@@ -173,7 +173,7 @@ def merged(
     """
     xp = namespace(rows, visit)
     count = rows[..., 0] + rated
-    share = rated / xp.maximum(count, xp.ones_like(count))
+    share = rated / at_least(count, 1.0)
     before = rows[..., _SUMMARY]
     summary = before + share[..., None] * (visit[..., _SUMMARY] - before)
     counts, means, squares = _columns(rows)
@@ -181,7 +181,7 @@ def merged(
     new = visit[..., counts] * rated[..., None]
     each = rows[..., counts] + new
     gap = rating - before
-    mean = before + new / xp.maximum(each, xp.ones_like(each)) * gap
+    mean = before + new / at_least(each, 1.0) * gap
     square = rows[..., squares] + new * gap * (rating - mean)
     return xp.concat([count[..., None], summary, each, mean, square], axis=-1)
 

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Integer
 
 
+WAIT = 1024  # rated steps that a sample is shown before it takes them in
+
+
 class _Rows:
     """Feedback by number, as rows (see ``uard.ratings.aggregate.to_rows``); grows in rows and in raters.
 
@@ -41,14 +44,15 @@ class _Rows:
             more = np.zeros((max(size, 2 * room, 64) - room, self.values.shape[1]), order="F")
             self.values = np.concatenate([self.values, more])
 
-    def fitted(self, visit: Feedback) -> Float[np.ndarray, "B width"]:
-        """Return a visit as rows of this width; raters who have not been met before get columns."""
-        assert visit.by_rater is not None
-        raters = visit.by_rater.count.shape[1]
-        if raters > self.raters:
-            self.values = np.asfortranarray(to_rows(_widened(from_rows(self.values), raters)))
-            self.raters = raters
-        return to_rows(visit if raters == self.raters else _widened(visit, self.raters))
+    def fitted(self, visit: Float[np.ndarray, "B any"]) -> Float[np.ndarray, "B width"]:
+        """Return the rows of visits with this width; raters who have not been met before get columns."""
+        raters = (visit.shape[1] - 5) // 3
+        if raters == self.raters:
+            return visit
+        if raters < self.raters:
+            return _widened(visit, self.raters)
+        self.values, self.raters = np.asfortranarray(_widened(self.values, raters)), raters
+        return visit
 
 
 def _checked(rows: Float[np.ndarray, "n width"]) -> Float[np.ndarray, "n width"]:
@@ -68,12 +72,13 @@ def _checked(rows: Float[np.ndarray, "n width"]) -> Float[np.ndarray, "n width"]
     return rows
 
 
-def _widened(feedback: Feedback, raters: int) -> Feedback:
-    """Return feedback (B,) with columns for more raters, who have rated nothing."""
+def _widened(rows: Float[np.ndarray, "B any"], raters: int) -> Float[np.ndarray, "B width"]:
+    """Return rows with columns for more raters, who have rated nothing."""
+    feedback = from_rows(rows)
     each = feedback.by_rater
     assert each is not None
     more = ((0, 0), (0, raters - each.count.shape[1]))
-    return feedback._replace(by_rater=ByRater._make(np.pad(x, more) for x in each))
+    return to_rows(feedback._replace(by_rater=ByRater._make(np.pad(x, more) for x in each)))
 
 
 class FeedbackTable:
@@ -114,7 +119,12 @@ class FeedbackTable:
         """
         rows = self._rows
         rows.grow(size)
-        new, left = rows.fitted(visit), visit.count.nonzero()[0]
+        new, left = rows.fitted(to_rows(visit)), visit.count.nonzero()[0]
+        if len(left) == 1:  # without copies of the others
+            place, now = int(slots[left[0]]), slice(int(left[0]), int(left[0]) + 1)
+            known = rows.values[place : place + 1]
+            known[...] = merged(known, new[now], visit.count[now])
+            return
         while left.size:  # a state-action that was visited twice takes two rounds
             places, now = slots[left], left
             if len(set(places.tolist())) < left.size:
@@ -122,6 +132,14 @@ class FeedbackTable:
                 places = slots[now]
             rows.values[places] = merged(rows.values[places], new[now], visit.count[now])
             left = np.setdiff1d(left, now) if now.size < left.size else left[:0]
+
+    def visits(self, slot: int) -> float:
+        """Return how often a state-action was visited and rated."""
+        return float(self._rows.values[slot, 0])
+
+    def counts(self, slots: Integer[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+        """Return how often some state-actions were visited and rated."""
+        return self._rows.values[:, 0][slots]
 
     def __getitem__(self, slots: Integer[np.ndarray, " B"]) -> Feedback:
         """Return what is known of some state-actions, (B,) arrays."""
@@ -147,15 +165,24 @@ class RatingSample:
         """Start with none; ``capacity`` is how many are kept."""
         self._capacity, self._random = capacity, np.random.default_rng(seed)
         self._rows, self._seen = _Rows(), 0
+        self._waiting: list[np.ndarray] = []  # rows that were shown but not taken in: many at once cost what one does
+        self._wait = 0  # how many
 
     def rows(self) -> Float[np.ndarray, "n width"]:
         """Return the rows that were kept."""
+        self._take_in()
         return self._rows.values[: self._rows.filled]
 
     @property
     def chance(self) -> dict[str, Any]:
         """How many steps it was shown, and the state of its random numbers."""
+        self._take_in()
         return {"seen": self._seen, "random": self._random.bit_generator.state}
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        """Take what was pickled, also before steps waited."""
+        self._waiting, self._wait = [], 0
+        self.__dict__.update(kept)
 
     def restore(self, rows: Float[np.ndarray, "n width"], chance: dict[str, Any]) -> None:
         """Go on where another with these ``rows`` and this ``chance`` was.
@@ -168,21 +195,37 @@ class RatingSample:
         if len(rows) != min(chance["seen"], self._capacity):
             raise _checks.InvalidValueError("number of rows", len(rows), "as many as were seen, or can be kept")
         self._rows, self._seen = _Rows(rows), chance["seen"]
+        self._waiting, self._wait = [], 0
         self._random.bit_generator.state = chance["random"]
 
     def put(self, visit: Feedback) -> None:
         """Show it rated steps, (B,) arrays as ``aggregate`` gives them."""
-        rows, size = self._rows, len(visit.count)
+        new = to_rows(visit)  # a copy: what the visit holds is its owner's
+        if self._waiting and self._waiting[0].shape[1] != new.shape[1]:
+            self._take_in()
+        self._waiting.append(new)
+        self._wait += len(new)
+        if self._wait >= WAIT:
+            self._take_in()
+
+    def _take_in(self) -> None:
+        """Give the steps that wait a place, or none."""
+        if not self._waiting:
+            return
+        new = self._waiting[0] if len(self._waiting) == 1 else np.concatenate(self._waiting)
+        self._waiting, self._wait = [], 0
+        rows, size = self._rows, len(new)
         places = np.arange(rows.filled, rows.filled + size)
         free = min(size, self._capacity - rows.filled)
         if free < size:
             places[free:] = self._random.integers(0, self._seen + np.arange(free, size) + 1)
         rows.grow(rows.filled + free)
         kept = places < self._capacity
-        new = rows.fitted(visit)  # before the table is written to: it may get columns
+        new = rows.fitted(new)  # before the table is written to: it may get columns
         rows.values[places[kept]] = new[kept]  # where two take one place, NumPy leaves the later
         self._seen += size
 
     def feedback(self) -> Feedback:
         """Return what is known of the steps that were kept, (n,) arrays."""
+        self._take_in()
         return self._rows.feedback()

@@ -300,10 +300,32 @@ class RewardStream:
         """Return what is known of state-actions at places that ``observe`` gave, (B,) arrays."""
         return self._table[slots]
 
+    def visits(self, key: Hashable) -> float:
+        """Return how many rated visits are known of a key; 0 of one that never came, or was forgotten."""
+        place = self._slots.get(key)
+        return 0.0 if place is None else self._table.visits(place)
+
+    def counts(self, slots: Int[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+        """Return how many rated visits are known of state-actions at places that ``observe`` gave."""
+        return self._table.counts(slots)
+
+    def measurement(self, keyed: bool) -> int:
+        """Return the number of the panel's statistics that rewards are filtered by now; they are measured if due.
+
+        As long as it is the same, and nothing new is known of a state-action, its reward is filtered alike.
+
+        Args:
+            keyed: As for ``filter``.
+        """
+        self._measured(keyed)
+        return self._measurement
+
+    _measurement = 0  # of the class, for streams that were pickled before there was one
+
     def _measured(self, keyed: bool) -> Any:
         """Return the panel's statistics, measured again when enough has been rated since."""
         if self.rated >= self._due:
-            self._statistics.clear()
+            self._forget_statistics()
             self._due = self.rated + max(1, min(self.rated, self._refresh), len(self._slots) // SHARE)
         if keyed not in self._statistics:
             every = self._table.every() if keyed else self._sample.feedback()
@@ -311,6 +333,10 @@ class RewardStream:
                 every = nothing((1,), 1)
             self._statistics[keyed] = self.mitigation.fit(every, every.count > 0)
         return self._statistics[keyed]
+
+    def _forget_statistics(self) -> None:
+        self._statistics.clear()
+        self._measurement += 1
 
     def save(self, path: str | Path) -> None:
         """Write all that it knows to a file of arrays and JSON, for ``load``; the old file stays whole until then.
@@ -336,7 +362,7 @@ class RewardStream:
         plain["abstention"] = None if self.abstention is None else state.described(self.abstention)["fields"]
         plain["keys"] = [state.plain_key(key) for key in self._slots]
         slots = np.fromiter(self._slots.values(), np.int64, len(self._slots))
-        self._statistics.clear()
+        self._forget_statistics()
         return state.State(plain, {**rows, "slots": slots})
 
     @classmethod
@@ -399,6 +425,7 @@ class RewardStream:
             raise _checks.InvalidValueError("keys", keys, f"{size} different ones, each with a row")
         self._sample.restore(arrays["sample"], plain["chance"])
         self.rated = plain["rated"]
+        self._forget_statistics()
         for name in COUNTERS:
             setattr(self, f"_{name}", plain[name])
 
