@@ -49,4 +49,4 @@ class AcquisitionStudy:
             for table in shown.tables(data):
                 terminal.show(table)
             for loss in shown.losses(data):
-                print(printable(loss))
+                print(printable(loss.sentence()))

@@ -37,4 +37,4 @@ class BestOfN:
         if self.json != "-":
             terminal.show(shown.table(data))
             for loss in shown.losses(data):
-                print(printable(loss))
+                print(printable(loss.sentence()))

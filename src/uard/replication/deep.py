@@ -134,11 +134,10 @@ def _missed(p: Published) -> list[Loss]:
             out.append(Loss("fails", "deep agents", "more than half a trap visit", where, ours=hacks, metric="hacks"))
         if goals.mean < 0.95:
             reference = unable.get(r["agent"])
-            against = ("", goals) if reference is None else ("true reward", goals, p.of(reference, "success_rate"))
-            why = "" if reference is None else "the agent misses them on the true reward, too"
-            out.append(
-                Loss("fails", "deep agents", "less than 95 % goals", where, *against, metric="goal rate", why=why)
-            )
+            theirs = None if reference is None else p.of(reference, "success_rate")
+            who, why = ("", "") if theirs is None else ("true reward", "the agent misses them on the true reward, too")
+            what = "less than 95 % goals"
+            out.append(Loss("fails", "deep agents", what, where, who, goals, theirs, "goal rate", why=why))
     return out
 
 

@@ -52,7 +52,8 @@ def _colluding(results: StudyResults) -> list[Loss]:
             f"hacks in {len(fooled)} of {len(every)} settings in which all raters repeat the lie",
             _name(best),
             best["mitigation"],
-            *(results.of(x.cell, "true_return") for x in (mine, best)),
+            results.of(mine.cell, "true_return"),
+            results.of(best.cell, "true_return"),
             "true return",
             *of_family(family, i),
             why="agreement is read as truth; who escapes shuns whatever noisy raters rate",
@@ -87,10 +88,10 @@ def _denied(results: StudyResults) -> list[Loss]:
             i = max(better, key=lambda i: results.of(pairs[i][0].cell, "success_rate").mean)
             best = pairs[i][0]
             rules = "rule reaches" if len(better) == 1 else "rules reach"
-            numbers = (results.of(x.cell, "success_rate") for x in (r, best))
+            own, theirs = (results.of(x.cell, "success_rate") for x in (r, best))
             what = f"one rater against all others takes the goal away; {len(better)} {rules} it more often"
             why = "of three nobody can know who is right; of five vetoes=1 overrules a lone one"
-            against = (best["mitigation"], *numbers, "share of goals", *of_family(family, i))
+            against = (best["mitigation"], own, theirs, "share of goals", *of_family(family, i))
             out.append(Loss("beaten", "grids", what, r["panel"], *against, why=why))
     return out
 
@@ -144,7 +145,8 @@ def _loss(results: StudyResults, rival: Row, ours: Row, family: Family, i: int) 
         f"{name} earns more" if told else f"{name} has the highest mean",
         _name(ours),
         name,
-        *(results.of(r.cell, "true_return") for r in (ours, rival)),
+        results.of(ours.cell, "true_return"),
+        results.of(rival.cell, "true_return"),
         "true return",
         *of_family(family, i),
     )
