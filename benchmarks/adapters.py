@@ -134,17 +134,17 @@ def _on_policy(algorithm: Any, wrapped: bool) -> Callable[[int], Any]:
                 "rollout_buffer_class": ReliabilityRolloutBuffer,
                 "rollout_buffer_kwargs": {"mitigation": Unchanged()},
             }
-        return algorithm("MlpPolicy", env, n_steps=64, batch_size=64, seed=0, **buffer)
+        return algorithm("MlpPolicy", env, n_steps=256, batch_size=64, seed=0, **buffer)
 
     return build
 
 
 DQN_OPTIONS = {"learning_starts": 100, "train_freq": 1, "batch_size": 64, "buffer_size": 10_000}
 CASES = [
-    Case("PPO, Hopper, 8 envs, rollout buffer", 0.02, 512, 4, _on_policy(PPO, False)),
-    Case("TRPO, Hopper, 8 envs, rollout buffer", 0.02, 512, 4, _on_policy(TRPO, False)),
-    Case("PPO, Hopper, 8 envs, wrapped", None, 512, 3, _on_policy(PPO, True)),
-    Case("TRPO, Hopper, 8 envs, wrapped", None, 512, 3, _on_policy(TRPO, True)),
+    Case("PPO, Hopper, 8 envs, rollout buffer", 0.02, 2048, 1, _on_policy(PPO, False)),
+    Case("TRPO, Hopper, 8 envs, rollout buffer", 0.02, 2048, 1, _on_policy(TRPO, False)),
+    Case("PPO, Hopper, 8 envs, wrapped", None, 2048, 1, _on_policy(PPO, True)),
+    Case("TRPO, Hopper, 8 envs, wrapped", None, 2048, 1, _on_policy(TRPO, True)),
     Case("SAC, Hopper, critics lent", 0.04, 20, 6, _off_policy(SAC, HOPPER, learning_starts=10)),
     Case("DQN, grid, an update a step", 0.06, 100, 8, _off_policy(DQN, GRID, **DQN_OPTIONS)),
     Case("DQN, CartPole, no keys", None, 100, 5, _off_policy(DQN, "CartPole-v1", **DQN_OPTIONS)),
