@@ -2,10 +2,13 @@
 
     python benchmarks/tabular.py [--repetitions N] [--json FILE]
 
-Everything trains five heads on uard/TrapGrid10-v0. All contenders take turns, so that a busy machine slows all of
-them; a ratio is taken within a turn. The Python loop and the C loops run raw Q-learning and keep the fused program's
-log. The leanest C loop leaves out what the defaults do not need, the heads' bootstrap masks; the other draws and
-applies them, as the fused program does. Steps are environment steps actually taken; compilation is not counted.
+Everything trains five heads on uard/TrapGrid10-v0, pinned to one core. All contenders take turns, so that a busy
+machine slows all of them; a ratio is taken within a turn, and time is the process's own on its core, so that what
+others take of it is not counted. The Python loop and the C loops run raw Q-learning and keep the fused program's log.
+The leanest C loop leaves out what the defaults do not need, the heads' bootstrap masks; the other draws and applies
+them, as the fused program does. The plain mean of the annotations is what listening costs any rule: to simulate what
+the raters answer and to remember it. Steps are environment steps actually taken; compilation is not counted. It takes
+less than two minutes.
 """
 
 from __future__ import annotations
@@ -46,7 +49,7 @@ from uard.training.episode_log import LOG
 GRID = paper_grid(10)
 AGENT = QLearning(heads=5)
 EPISODES = 500
-MITIGATIONS = ("raw", "uard", "uard-0.1", "median", "lcb", "worst-of-annotations", "uard-paper")
+MITIGATIONS = ("raw", "mean-of-annotations", "uard")
 PYTHON, C, C_MASKS = "Python + Gymnasium, raw", "C, raw, leanest", "C, raw, with masks"
 
 C_SOURCE = r"""
@@ -140,9 +143,9 @@ def python_loop(seconds: float) -> Callable[[int], Run]:
     def turn(seed: int) -> Run:
         rng = np.random.default_rng(seed)
         q = rng.uniform(-AGENT.init_scale, AGENT.init_scale, (states, actions, AGENT.heads))
-        epsilon, steps, begun = AGENT.epsilon, 0, time.perf_counter()
+        epsilon, steps, begun = AGENT.epsilon, 0, time.process_time()
         log = []
-        while time.perf_counter() - begun < seconds:
+        while time.process_time() - begun < seconds:
             state, _ = env.reset(seed=seed if not steps else None)
             visits, true_return, observed_return, length, done = 0, 0.0, 0.0, 0, False
             while not done:
@@ -158,7 +161,7 @@ def python_loop(seconds: float) -> Callable[[int], Run]:
             log.append((visits, true_return, observed_return, terminated, length))
             steps += length
             epsilon = max(AGENT.epsilon_min, AGENT.epsilon_decay * epsilon)
-        return Run(steps, time.perf_counter() - begun)
+        return Run(steps, time.process_time() - begun)
 
     return turn
 
@@ -170,9 +173,9 @@ def fused_program(mitigation: str, count: int) -> Callable[[int], Run]:
 
     def turn(seed: int) -> Run:
         batch = [fused.make_run(task, law, truth, AGENT, named(mitigation), seed * count + i) for i in range(count)]
-        begun = time.perf_counter()
+        begun = time.process_time()
         out = fused.train(batch, program)
-        seconds = time.perf_counter() - begun
+        seconds = time.process_time() - begun
         logs = np.stack([o["log"] for o in out])
         return Run(int(sum(int(o["steps"]) for o in out)), seconds, late(logs))
 
@@ -221,7 +224,7 @@ def c_loop(compiler_path: str, folder: Path, runs: int, masks: bool) -> Callable
         logs = np.zeros((runs, EPISODES, 5), np.float32)
         pointers = [ctypes.c_void_p(t.ctypes.data) for t in tables]
         settings = [ctypes.c_float(x) for x in numbers]
-        begun, steps = time.perf_counter(), 0
+        begun, steps = time.process_time(), 0
         for i in range(runs):
             steps += train(
                 *pointers,
@@ -232,18 +235,15 @@ def c_loop(compiler_path: str, folder: Path, runs: int, masks: bool) -> Callable
                 ctypes.c_uint64(seed * runs + i),
                 ctypes.c_void_p(logs[i].ctypes.data),
             )
-        return Run(steps, time.perf_counter() - begun, late(logs))
+        return Run(steps, time.process_time() - begun, late(logs))
 
     return turn
 
 
 def measure(contenders: dict[str, Callable[[int], Run]], repetitions: int) -> dict[str, list[Run]]:
     """Let all contenders take turns; the first turn of each is not counted."""
-    first: dict[str, float] = {}
-    for name, turn in contenders.items():
-        begun = time.perf_counter()
+    for turn in contenders.values():
         turn(0)
-        first[name] = time.perf_counter() - begun
     runs: dict[str, list[Run]] = {name: [] for name in contenders}
     for repetition in range(1, repetitions + 1):
         for name, turn in contenders.items():
@@ -266,15 +266,18 @@ def ratios(runs: dict[str, list[Run]]) -> Iterator[dict[str, Any]]:
         ("fused raw / Python", raw, PYTHON, ">=", 200.0),
         ("leanest C / fused raw", C, raw, "<=", 3.0),
         ("C with masks / fused raw", C_MASKS, raw, "<=", 3.0),
-        ("fused raw / fused uard: its cost", raw, "fused, uard", "<=", 3.0),
-        ("fused raw / fused uard-0.1: its cost", raw, "fused, uard-0.1", "<=", 3.0),
+        ("raw / mean: what listening costs", raw, "fused, mean-of-annotations", "", None),
+        ("raw / uard: what the rule costs", raw, "fused, uard", "<=", 2.0),
     ]
     for label, above, below, sense, bound in promised:
         if above not in runs or below not in runs:
             continue
         values = [a / b for a, b in zip(speeds(runs[above]), speeds(runs[below]), strict=True)]
-        met = statistics.median(values) >= bound if sense == ">=" else statistics.median(values) <= bound
-        yield {"ratio": label, **summary(values), "asked": f"{sense} {bound:g}", "met": met}
+        found = {"ratio": label, **summary(values), "asked": None, "met": None}
+        if bound is not None:
+            met = statistics.median(values) >= bound if sense == ">=" else statistics.median(values) <= bound
+            found |= {"asked": f"{sense} {bound:g}", "met": met}
+        yield found
 
 
 def cpu() -> str:
@@ -307,7 +310,8 @@ def show(report: dict[str, Any]) -> None:
     table = Table("ratio", "median", "min", "max", "asked", "met")
     for row in report["ratios"]:
         numbers = [f"{row[k]:.2f}" for k in ("median", "min", "max")]
-        table.add_row(row["ratio"], *numbers, row["asked"], "yes" if row["met"] else "no")
+        asked = [row["asked"], "yes" if row["met"] else "no"] if row["asked"] else ["", ""]
+        table.add_row(row["ratio"], *numbers, *asked)
     console.print(table)
 
 
