@@ -217,3 +217,43 @@ def test_a_constant_reward_has_a_unit():
 def test_what_is_refused(field: str, value: Any):
     with pytest.raises(InvalidValueError, match=f"^{field} = "):
         RatingModel(**{field: value})
+
+
+def test_tables_at_once_are_fitted_as_step_by_step():
+    known, key = rated_world(HALF), jax.random.key(3)
+    model = rating_model.init(SPEC, jax.random.key(0), STATES, ACTIONS, RATERS)
+    one = jax.jit(lambda: rating_model.fit(SPEC, model, known, WORLD.observe, ACTIONS, key))()
+    at_once = jax.jit(lambda: rating_model.fit_table(SPEC, model, known, ACTIONS, key))()
+    before = jax.tree.leaves(model.layers)
+    for old, a, b in zip(before, *map(jax.tree.leaves, (one.layers, at_once.layers)), strict=True):
+        assert np.abs(np.asarray(a) - old).max() > 1e-3
+        np.testing.assert_allclose(a, b, atol=2e-5)
+    np.testing.assert_allclose(one.location, at_once.location, rtol=1e-6)
+
+
+@pytest.mark.parametrize("rated", [0, 1, 255, 256, 257, 400])
+def test_only_rated_slots_are_looked_at(rated: int):
+    slots = np.zeros(400, bool)
+    slots[np.random.default_rng(rated).permutation(400)[:rated]] = True
+    known = rated_world(slots)
+    table = jax.jit(lambda: rating_model.of_rated(known, lambda places: (places + 1, 2 * places[:, None])))()
+    number = np.arange(400)
+    np.testing.assert_array_equal(table[0], slots * (number + 1))
+    np.testing.assert_array_equal(table[1][:, 0], 2 * slots * number)
+
+
+def test_rows_are_not_copied_at_every_step():
+    known = rating_model.memory(8192, jnp.int32(0), RATERS)
+    visit = aggregate(jnp.ones(RATERS), jnp.float32(1.0))
+
+    def steps(known: Memory) -> Memory:
+        def one(known: Memory, slot: Any) -> tuple[Memory, None]:
+            return rating_model.remember(known, slot, slot, slot % 4, visit, jnp.float32(1.0)), None
+
+        return jax.lax.scan(one, known, jnp.arange(100))[0]
+
+    text = str(jax.jit(steps).lower(known).compile().as_text())
+    body = text[: text.index("ENTRY")]  # copied once before the loop is no matter
+    width = known.rows.shape[1]
+    assert f"f32[8192,{width}]" in body
+    assert f"f32[8192,{width}]{{1,0}} copy(" not in body

@@ -153,12 +153,19 @@ class FeedbackSource:
         rated = rated if law.reach is None else rated * law.reach
         return rating_model.remember(known, self.world.slot(state, action), state, action, visit, rated)
 
-    def fit(self, known: rating_model.Memory, model: Any, key: Array) -> Any:
-        """Fit the model to what was collected."""
+    def fit(self, known: rating_model.Memory, model: Any, *keys: Array) -> Any:
+        """Fit the model to what was collected, once for each key."""
         if not self.used or self.spec is None:
             return model
-        fitted = rating_model.fit(self.spec, model[0], known, self.world.observe, self.world.actions, key)
-        fitted = rating_model.with_noise(self.spec, fitted, known, self.world.observe, self.world.actions)
+        spec, world, fitted = self.spec, self.world, model[0]
+
+        def once(fitted: rating_model.Model, key: Array) -> tuple[rating_model.Model, None]:
+            if self.tabulates:
+                return rating_model.fit_table(spec, fitted, known, world.actions, key), None
+            return rating_model.fit(spec, fitted, known, world.observe, world.actions, key), None
+
+        fitted, _ = lax.scan(once, fitted, jnp.stack(keys))
+        fitted = rating_model.with_noise(spec, fitted, known, world.observe, world.actions)
         return fitted, self._table(fitted)
 
     def panel_statistics(self, known: rating_model.Memory, model: Any) -> Any:
@@ -168,10 +175,15 @@ class FeedbackSource:
         return self.mitigation.fit(self.of_memory(known, model), known.rows[:, 0] > 0)
 
     def of_memory(self, known: rating_model.Memory, model: Any) -> Feedback:
-        """Return the feedback of every slot's state-action, (M,) arrays."""
+        """Return the feedback of every slot's state-action, (M,) arrays; 0 where a model was never told anything."""
         if self.spec is None:
             return from_rows(known.rows)
-        return self.of(known, model, known.states, known.actions, from_rows(known.rows).proxy)
+
+        def one(slots: Array) -> Feedback:
+            states = jax.tree.map(lambda x: x[slots], known.states)
+            return self.of(known, model, states, known.actions[slots], from_rows(known.rows[slots]).proxy)
+
+        return rating_model.of_rated(known, one)
 
     def of(self, known: rating_model.Memory, model: Any, states: Any, actions: Array, reward: Array) -> Feedback:
         """Return the feedback of state-actions with an observed reward, (B,) arrays."""
@@ -179,6 +191,8 @@ class FeedbackSource:
             return self._nothing(actions.shape)
         if self.spec is None:
             return from_rows(known.rows[jax.vmap(self.world.slot)(states, actions)])
+        if self.tabulates:
+            return rating_model.observing(model[1].map(lambda x: x[states, actions]), reward)
         chosen = jnp.arange(self.world.actions) == actions[:, None]
 
         def pick(x: Array) -> Array:  # (B, A) or, of each rater, (B, A, K)

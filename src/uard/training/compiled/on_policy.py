@@ -114,9 +114,7 @@ def train_one(run: Run, program: Program) -> TrainedAgent:
 
         # One step after the other: several may be of one state-action, whose running means each of them moves.
         known, _ = lax.scan(collect, c.known, (flat, jax.random.split(panel_key, total)))
-        model, _ = lax.scan(
-            lambda model, key: (source.fit(known, model, key), None), c.model, jax.random.split(model_key, fits)
-        )
+        model = source.fit(known, c.model, *jax.random.split(model_key, fits))
         return known, model, source.panel_statistics(known, model)
 
     def log_episodes(c: _Carry, flat: _Row) -> tuple[Array, Array]:
