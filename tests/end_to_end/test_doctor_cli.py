@@ -61,7 +61,7 @@ def test_json(log, capsys, tmp_path):
         "uard-operator",
     )
     (found,) = answer["findings"]
-    assert found.keys() == {"code", "severity", "evidence", "consequence", "remedy", "numbers"}
+    assert found.keys() == {"code", "severity", "evidence", "consequence", "remedy", "numbers", "how"}
     assert (found["code"], found["numbers"]["rows"]) == ("reward-contradicted", 5)
     code, out, _ = doctor(capsys, log(LIE), "--json", tmp_path / "deep" / "out.json")
     assert "reward-contradicted" in out
@@ -81,14 +81,14 @@ def test_environments(capsys, panel, code):
     got, out, _ = doctor(capsys, "uard/TrapGrid6-v0", "--set", f"panel={panel}", "--steps", 400)
     assert got == code
     assert ("colluding-raters" in out) == (panel == "colluding")
-    assert "uard/TrapGrid6-v0, 400 random steps, seed 0: 400 rows, 3 raters" in out
+    assert "uard/TrapGrid6-v0, 400 random steps, seed 0: 400 rows, 3 raters" in " ".join(out.split())
 
 
 def test_columns(log, capsys):
     path = log(LIE.replace("reward", "score").replace("rating_ann", "ann"))
     code, out, _ = doctor(capsys, path, "--reward", "score", "--ratings", "ann", "rating_bob")
     assert code == 0
-    assert "2 raters (ann, rating_bob)" in out
+    assert "2 raters (ann, rating_bob)" in " ".join(out.split())
 
 
 @pytest.mark.parametrize(

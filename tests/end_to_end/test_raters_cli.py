@@ -36,7 +36,7 @@ def test_table_and_json(path, capsys, tmp_path):
     code, out, _ = run(capsys, path, *OPTIONS, "--json", tmp_path / "found.json")
     found = json.loads((tmp_path / "found.json").read_text())
     assert code == 0
-    assert "30 items, 2 raters, 60 answers; bias is against the other raters" in out
+    assert "30 items, 2 raters, 60 answers; bias is against the other raters" in " ".join(out.split())
     assert [r["bias"]["value"] for r in found["raters"]] == pytest.approx([-1.0, 1.0])  # bob gives one more
     assert [s["name"] for s in found["agreement"]["within"]] == ["a", "b"]
     assert found["effective"]["against"] == "part"

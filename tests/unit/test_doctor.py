@@ -207,7 +207,7 @@ def test_a_penalty_that_becomes_smaller():
     found = finding(doctor(log, PRINTED), "smaller-penalties")
     assert found.severity == "danger"
     assert found.numbers == {"penalties": 50, "largest_gain": pytest.approx(1.0), "turned": 1.0}
-    assert "On this log named('uard') avoids it" in found.remedy
+    assert "On this log uard avoids it" in found.remedy
     assert finding(doctor(log), "smaller-penalties").severity == "note"
 
 

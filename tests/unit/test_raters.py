@@ -135,7 +135,7 @@ def test_a_rater_whom_the_rule_does_not_hear():
     assert [r.heard for r in found.raters] == [True, True, False, True]
     assert found.raters[2].why == "noise over 2 times the usual"
     assert found.raters[2].words == ("noisy",)
-    assert "no: noise over 2 times the usual" in str(found)
+    assert "not heard: noise over 2 times the usual" in str(found)
 
 
 # Properties.

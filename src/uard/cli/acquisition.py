@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from uard import __version__, _checks
-from uard._support.text import counted, printable
+from uard._support.text import counted
 from uard.cli import progress, terminal
 
 if TYPE_CHECKING:
@@ -49,4 +49,4 @@ class AcquisitionStudy:
             for table in shown.tables(data):
                 terminal.show(table)
             for loss in shown.losses(data):
-                print(printable(loss.sentence()))
+                terminal.paragraph(terminal.output(), loss.sentence(), rest="  ")

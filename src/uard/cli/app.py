@@ -75,6 +75,7 @@ def _run(arguments: list[str]) -> None:
 
     from uard.cli import terminal
 
+    terminal.shows_what_it_can()
     console = Console(stderr=True, highlight=False)
     command = _parsed(arguments, console)
     try:
@@ -95,6 +96,7 @@ def _parsed(arguments: list[str], console: Console) -> Command:
     """Return the command with its options; those of packages are imported only if none of ours is named."""
     import tyro
 
+    from uard.cli import help as helping
     from uard.cli import settings, terminal
     from uard.cli.commands import brought, own
 
@@ -107,7 +109,12 @@ def _parsed(arguments: list[str], console: Console) -> Command:
     kinds = tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in commands.items())
     union: Any = Union[kinds]  # noqa: UP007 (of as many as there are)
     text = "Rewards that cannot be fully trusted."
-    return tyro.cli(union, prog="uard", args=arguments, description=text, registry=settings.numbers())
+    if not helping.asked(arguments):
+        return tyro.cli(union, prog="uard", args=arguments, description=text, registry=settings.numbers())
+    for kind in commands.values():
+        helping.explain(kind)
+    with helping.broken():
+        return tyro.cli(union, prog="uard", args=arguments, description=text, registry=settings.numbers())
 
 
 def _of_users() -> tuple[type[Exception], ...]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
+from uard._support.columns import decimals
 from uard._support.text import counted
 from uard.cli import terminal
 from uard.cli.terminal import MANY
@@ -60,18 +61,18 @@ def _print(found: Comparison) -> None:
         names = titles(studies.every())
         shown = [("all cells that differ", None, e) for e in found.everywhere[:1]]
         shown += [(names.get(c.key) or compare.title(c.config), c, c.effects[0]) for c in differing[:MANY]]
+        digits = decimals([e.difference for _, c, e in shown if c], most=4)
         rows = []
         for name, c, e in shown:
             counts = (str(len(c.seeds)), str(len(c.identical))) if c else ("", "")
-            effect = "none" if e.effect is None else f"{e.effect:+.2f}"
-            difference = f"{e.difference:+.4g}" if c else ""
-            rows.append((name, *counts, e.metric, difference, effect, f"{e.p:.3g}"))
+            effect = "none" if e.effect is None else f"{e.effect:+z.2f}"
+            difference = f"{e.difference:+z.{digits}f}" if c else ""
+            rows.append((name, *counts, e.metric, difference, effect, f"{e.p:.4f}"))
         columns = ("cell", "seeds", "identical", "metric", "B - A", "in seed sd", "p, corrected")
         marked = {i for i, (_, _, e) in enumerate(shown) if e.differs}
         terminal.table(columns, rows, marked=marked, out=out)
         if len(differing) > MANY:
-            terminal.say(
-                out, f"and {counted(len(differing) - MANY, 'more cell')} with differences; --json has them all"
-            )
+            more = counted(len(differing) - MANY, "more cell")
+            terminal.paragraph(out, f"and {more} with differences; --json has them all")
     for line in compare.lines(found):
-        terminal.say(out, line)
+        terminal.paragraph(out, line, rest="  ")

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from uard import InvalidValueError, __version__, _checks
-from uard._support.text import printable
 from uard.cli import terminal
 from uard.cli.settings import Pairs, Words
 from uard.cli.settings import mitigation as mitigation_named
@@ -77,7 +76,7 @@ class Doctor:
         if self.json is not None:
             terminal.write_json({"version": __version__} | found.as_data(), self.json)
         if self.json != "-":
-            print(printable(str(found)))
+            terminal.lines(found.text(min(100, terminal.width())))
         if found.count("danger") or (self.strict and found.count("warning")):
             sys.exit(1)
 

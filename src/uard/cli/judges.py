@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from uard import __version__, _checks
-from uard._support.text import printable
 from uard.cli import terminal
 from uard.cli.settings import Words
 
@@ -68,7 +67,7 @@ class Judges:
         if self.json is not None:
             terminal.write_json({"version": __version__} | fitted.as_data(), self.json)
         if self.json != "-":
-            print(printable(str(fitted)))
+            terminal.lines(fitted.text(terminal.width()))
         if self.out is not None:
             terminal.say(console, f"the panel is in {self.out}: JudgePanel.load({self.out!r}), or panel={self.out!r}")
 

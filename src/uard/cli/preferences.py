@@ -47,5 +47,5 @@ class Preferences:
                 if agreement is None
                 else f"{agreement:.3f} (about 0.5 by chance if there are no ties)"
             )
-            rows = [*((name, str(n)) for name, n in counts.items()), ("agreement of two raters", shown)]
-            terminal.table(("", "answers"), rows, title=found.source)
+            terminal.table(("answers", ""), [(name, str(n)) for name, n in counts.items()], title=found.source)
+            terminal.paragraph(terminal.output(), f"agreement of two raters: {shown}")

@@ -45,7 +45,7 @@ class Status:
                 terminal.table(("rater", "answers", "skipped", "coverage", "link used"), rows, self.project)
             out = terminal.output()
             for line in _told(found):
-                terminal.say(out, line)
+                terminal.paragraph(out, line, rest="  ")
         for name, why in found["damaged"].items():
             terminal.warning(console, f"item {name} is not shown: {why}")
         projects.warn_unknown(console, found["unknown"])

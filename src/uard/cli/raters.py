@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
 from uard import InvalidValueError, __version__
-from uard._support.text import printable
 from uard.cli import terminal
 from uard.cli.settings import Words
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rich.console import Console
 
+    from uard.diagnosis.finding import Stratum
     from uard.ratings.log import RatingLog
 
 
@@ -69,7 +71,8 @@ class Raters:
             data = panel.as_data() | {"agreement": agreement, "order": order.as_data()}
             terminal.write_json({"version": __version__} | data, self.json)
         if self.json != "-":
-            print(printable("\n".join([str(panel), "", *_agreement(alpha, ends, strata), "", str(order)])))
+            width = terminal.width()
+            terminal.lines("\n\n".join([panel.text(width), _agreement(alpha, ends, strata, width), order.text(width)]))
 
     def _log(self, by: str | None = None, rating: str | None = None) -> RatingLog:
         from uard.ratings import readers
@@ -89,15 +92,14 @@ class Raters:
         return replace(log, ratings=-log.ratings, repeats=None)
 
 
-def _agreement(alpha: float | None, ends: tuple[float, float] | None, strata: Any) -> list[str]:
+def _agreement(alpha: float | None, ends: tuple[float, float] | None, strata: Sequence[Stratum], width: int) -> str:
     """Return a table of Krippendorff's alpha over all and within parts."""
-    from uard.ratings.raters import columns_of_text
+    from uard._support.columns import text
+    from uard.diagnosis.finding import interval
 
-    rows = [("over all", "", alpha, *(ends or (None, None)))]
-    rows += [(f"within {s.name}", str(s.rows), s.agreement, s.low, s.high) for s in strata]
-    shown = [
-        (name, n, "not defined" if a is None else f"{a:z.3f}", "" if low is None else f"{low:z.2f} to {high:z.2f}", "")
-        for name, n, a, low, high in rows
+    found = [("over all", "", alpha, *(ends or (None, None)))]
+    found += [(f"within {s.name}", str(s.rows), s.agreement, s.low, s.high) for s in strata]
+    rows = [
+        (name, n, "not defined" if a is None else f"{a:z.2f}{interval(low, high)}") for name, n, a, low, high in found
     ]
-    head = ("agreement (1 perfect, 0 chance)", "rows", "Krippendorff's alpha", "95 %", "")
-    return columns_of_text([head, *shown])
+    return text(("agreement (1 perfect, 0 chance)", "rows", "Krippendorff's alpha [95 %]"), rows, width)

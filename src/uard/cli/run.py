@@ -138,14 +138,8 @@ class Run:
 
     def _print(self, metrics: dict[str, Any]) -> None:
         title = f"{self.environment} / {self.agent} / {self.mitigation} / {self.panel}, {counted(self.seeds, 'seed')}"
-        rows = [
-            (
-                name.replace("_", " "),
-                f"{s.mean:.3f}",
-                f"{s.sd:.3f}" if s.ci95 else "–",
-                f"{s.ci95[0]:.3f} .. {s.ci95[1]:.3f}" if s.ci95 else "one run",
-                f"{s.iqm:.3f}",
-            )
-            for name, s in metrics.items()
-        ]
-        terminal.table(("metric", "mean", "sd", "95 % interval", "IQM"), rows, title)
+        rows = []
+        for name, s in metrics.items():
+            mean = f"{s.mean:z.3f} [{s.ci95[0]:z.3f}, {s.ci95[1]:z.3f}]" if s.ci95 else f"{s.mean:z.3f} one run"
+            rows.append((name.replace("_", " "), mean, f"{s.sd:.3f}" if s.ci95 else "–", f"{s.iqm:z.3f}"))
+        terminal.table(("metric", "mean [95 %]", "sd", "IQM"), rows, title)

@@ -55,16 +55,21 @@ class Status:
         from uard.lab.views import status
 
         out = terminal.output()
-        terminal.say(out, f"{self.store}: {counted(found.cells, 'cell')}, {counted(found.seeds, 'seed')}")
-        for line in (*status.said_of_damaged(found.damaged), *status.lines(found.runs)):
-            terminal.say(out, line)
-        columns = ("study", "seeds a cell", "finished", "in work", "failed", "missing", "last finished (UTC)")
+        told = [f"{self.store}: {counted(found.cells, 'cell')}, {counted(found.seeds, 'seed')}"]
+        for line in (*told, *status.said_of_damaged(found.damaged), *status.lines(found.runs)):
+            terminal.paragraph(out, line, rest="  ")
+        columns = ("study", "seeds a cell", "finished", "in work", "failed", "missing", "last (UTC)")
         rows = []
         for s in found.studies:
             numbers = (s.seeds, s.finished, s.claimed, s.failed, s.missing)
-            rows.append((s.name, *map(str, numbers), status.clock(s.last) if s.last else "-"))
-        terminal.table(columns, rows, out=out)
+            rows.append((s.name, *map(str, numbers), status.clock(s.last)[:16] if s.last else "-"))
+        if rows:
+            terminal.table(columns, rows, marked={i for i, s in enumerate(found.studies) if s.failed}, out=out)
         for failure in found.failures:
-            what = failure.why.traceback if self.errors else failure.why.error
-            when = status.clock(failure.why.created)
-            terminal.say(out, f"failed {when}: {failure.title}, seeds {list(failure.seeds)}: {what}")
+            when, what = status.clock(failure.why.created), failure.why.error
+            head = f"failed {when}: {failure.title}, seeds {list(failure.seeds)}:"
+            if self.errors:
+                terminal.paragraph(out, head, rest="  ")
+                terminal.lines(failure.why.traceback, out)
+            else:
+                terminal.paragraph(out, f"{head} {what}", rest="  ")

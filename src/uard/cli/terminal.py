@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import codecs
+import io
 import json
-from collections.abc import Container, Iterable, Mapping, Sequence
+import sys
+from collections.abc import Container, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from uard import _checks
+from uard._support import columns as layout
 from uard._support import files
 from uard._support.text import printable
 
@@ -16,7 +20,7 @@ if TYPE_CHECKING:
     from uard.lab.views.tables import Table
 
 MANY = 20  # lines of one kind, after which the rest is counted
-_PLAIN = 500  # rows from which on a table has plain columns: rich needs a second for a thousand rows
+_NARROW, _WIDE = 40, 120  # columns that are made use of, whatever a terminal says
 
 
 def output() -> Console:
@@ -24,6 +28,19 @@ def output() -> Console:
     from rich.console import Console
 
     return Console(highlight=False)
+
+
+def width(console: Console | None = None) -> int:
+    """Return how many columns a line may take: 80 where nobody says."""
+    return min(_WIDE, max(_NARROW, (console or output()).width))
+
+
+def shows_what_it_can() -> None:
+    """Let output whose encoding has no box or dash have something like it, instead of an error."""
+    codecs.register_error("uard.alike", layout.replaced)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and codecs.lookup(stream.encoding).name != "utf-8":
+            stream.reconfigure(errors="uard.alike")
 
 
 def say(console: Console, text: str, kind: str = "") -> None:
@@ -37,14 +54,33 @@ def say(console: Console, text: str, kind: str = "") -> None:
     console.print(kind + escape(text), soft_wrap=True)
 
 
+def paragraph(console: Console, text: str, first: str = "", rest: str | None = None, style: str | None = None) -> None:
+    """Print text in lines that fit, broken between words; see ``uard._support.columns.fill``."""
+    shown = _shown(text, console)
+    console.out(layout.fill(shown, width(console), first, rest), style=style, highlight=False)
+
+
+def lines(text: str, out: Console | None = None) -> None:
+    """Print text that has lines already as it is."""
+    out = out or output()
+    out.out(_shown(text, out), highlight=False)
+
+
 def error(console: Console, text: str) -> None:
     """Say what is wrong."""
-    say(console, text, "[red]error:[/red] ")
+    _message(console, text, "error:", "red")
 
 
 def warning(console: Console, text: str) -> None:
     """Say what is doubtful."""
-    say(console, text, "[yellow]warning:[/yellow] ")
+    _message(console, text, "warning:", "yellow")
+
+
+def _message(console: Console, text: str, kind: str, colour: str) -> None:
+    """Print a message: in one line where programs read it, between words where people do."""
+    if console.is_terminal:
+        text = layout.fill(printable(text), width(console) - len(kind) - 1, rest="").replace("\n", "\n  ")
+    say(console, text, f"[{colour}]{kind}[/{colour}] ")
 
 
 def escape(text: str) -> str:
@@ -52,6 +88,10 @@ def escape(text: str) -> str:
     from rich.markup import escape as escaped
 
     return escaped(printable(text))
+
+
+def _shown(text: str, out: Console) -> str:
+    return layout.encodable(printable(text), out.encoding)
 
 
 def table(
@@ -62,39 +102,35 @@ def table(
     marked: Container[int] = (),
     out: Console | None = None,
 ) -> None:
-    """Print a table.
+    """Print a table, as wide as the terminal at most; see ``uard._support.columns.lay_out``.
 
     Args:
         columns: Their heads.
         rows: As many texts each as there are columns.
         title: Above it.
-        labels: So many columns name the row and begin at the left; the others end at the right.
+        labels: So many columns name the row.
         marked: Numbers of rows that are red.
         out: Where to; standard output if left out.
     """
-    out, rows = out or output(), list(rows)
-    if len(rows) > _PLAIN:
-        out.out(_plain(columns, rows, title, labels), highlight=False)
-        return
-    from rich.table import Table as RichTable
+    out = out or output()
+    if title:
+        paragraph(out, title, style="bold")
+    heads, *texts = ([_shown(x, out) for x in row] for row in (columns, *rows))
+    part: list[str] = []
+    before: str | None = None
 
-    made = RichTable(title=escape(title), title_justify="left")
-    for i, column in enumerate(columns):
-        made.add_column(escape(column), justify="left" if i < labels else "right")
-    for i, row in enumerate(rows):
-        made.add_row(*map(escape, row), style="red" if i in marked else None)
-    out.print(made)
+    def tell() -> None:
+        if part:
+            out.out("\n".join(part), style=before, highlight=False)
+            part.clear()
 
-
-def _plain(columns: Sequence[str], rows: Sequence[Sequence[str]], title: str, labels: int) -> str:
-    title, *cells = map(printable, (title, *columns, *(x for row in rows for x in row)))
-    columns, *rows = (cells[i : i + len(columns)] for i in range(0, len(cells), len(columns)))
-    widths = [max(map(len, column)) for column in zip(columns, *rows, strict=True)]
-    lines = (
-        "  ".join(x.ljust(w) if i < labels else x.rjust(w) for i, (x, w) in enumerate(zip(r, widths, strict=True)))
-        for r in (columns, *rows)
-    )
-    return "\n".join([title, *(line.rstrip() for line in lines)])
+    for line in layout.lay_out(heads, texts, width(out), labels):
+        style = "dim" if line.row is None else "red" if line.row in marked else None
+        if style != before:
+            tell()
+        before = style
+        part.append(layout.encodable(line.text, out.encoding))
+    tell()
 
 
 def show(data: Table, out: Console | None = None) -> None:
@@ -102,16 +138,27 @@ def show(data: Table, out: Console | None = None) -> None:
     table(data.columns, data.texts(), data.title, data.labels, out=out)
 
 
-def glossary(title: str, entries: Mapping[str, str]) -> None:
-    """Print names and what they stand for."""
-    from rich.table import Table as RichTable
+def entries(title: str, rows: Sequence[tuple[str, str, str]], out: Console | None = None) -> None:
+    """Print names and what they stand for, a line each: of a text that is too long, the beginning.
 
-    made = RichTable("name", "", title=escape(title), title_justify="left", show_header=False, box=None, padding=(0, 2))
-    for name, text in entries.items():
-        made.add_row(f"[bold]{escape(name)}[/bold]", escape(text))
-    out = output()
-    out.print(made)
-    out.print()
+    Args:
+        title: Above them.
+        rows: Name, text, and what stands behind it and is never cut.
+        out: Where to; standard output if left out.
+    """
+    out = out or output()
+    room = width(out) - 4
+    told = [tuple(_shown(x, out) for x in row) for row in rows]
+    longest = max((n for name, *_ in told if (n := layout.width_of(name)) <= room // 2), default=0)
+    paragraph(out, title, style="bold")
+    for name, text, note in told:
+        left = room - max(longest, layout.width_of(name)) - layout.width_of(note) - bool(note)
+        shown = layout.shorten(text, left) if left >= _LEAST_TEXT else ""
+        gap = " " * max(0, longest - layout.width_of(name))
+        out.out(layout.encodable(f"  {name}{gap}  {f'{shown} {note}'.strip()}".rstrip(), out.encoding), highlight=False)
+
+
+_LEAST_TEXT = 12  # characters; less of a text says nothing
 
 
 def write_json(data: Any, target: str, field: str = "json", indent: int | None = 2) -> None:

@@ -36,9 +36,9 @@ def one_rater(case: Case) -> Finding | None:
         "danger" if blind else "warning",
         evidence,
         "One person never disagrees with itself: sigma_h = 0 is read as certainty, which means blind trust in the reward.",
-        "Compare ratings with the reward, as uard does (and uard-0.1 with proxy_is_rater=True); it then lives on their "
-        "distance, which noise can hide. Or have a second person rate a sample.",
+        "Have a second person rate a sample. Until then use uard, which compares the ratings with the reward; what one rater is noisy by can hide a lie.",
         numbers,
+        how="named('uard'), or named('uard-0.1', proxy_is_rater=True)",
     )
 
 
@@ -65,7 +65,7 @@ def contradicted(case: Case) -> Finding | None:
         f"{' and '.join(f'{name} still believes {percent(share)}' for name, share in kept.items())}.",
         "Agreement makes sigma_h small, so a filter that looks at the raters alone trusts the reward most where they "
         "all contradict it, and the agent learns to go there.",
-        f"Ask whether raters are centred at the reward, as named('uard') does: it believes {percent(recommended)} of it here.",
+        f"Use a filter that asks whether raters are centred at the reward, as uard does: it believes {percent(recommended)} of it here.",
         {
             "rows": float(agreed.sum()),
             "largest": float(gap[worst]),
@@ -94,9 +94,9 @@ def _other_units(case: Case, far: Bool[np.ndarray, " n"]) -> Finding:
         f"(means {numbers['mean_rating']:.3g} and {numbers['mean_reward']:.3g}; correlation {together:.2f}).",
         "The filter compares ratings with rewards: their distance is doubt, the lowest rating is the anchor. If they are "
         "in other units (stars against points) every reward is doubted or replaced by a number that means something else.",
-        "Bring the ratings into the reward's unit first, on rows that can be trusted. If they are in it already, the reward is "
-        "wrong nearly everywhere: learn from the ratings, named('worst-of-annotations') or named('lcb').",
+        "Bring the ratings into the reward's unit first, on rows that can be trusted. If they are in it already, the reward is wrong nearly everywhere: learn from the ratings instead.",
         numbers,
+        how="named('worst-of-annotations'), or named('lcb')",
     )
 
 

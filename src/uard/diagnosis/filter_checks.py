@@ -23,7 +23,7 @@ def by_setting(case: Case, check: Callable[[Case, FilterOutcome], Finding | None
         if case.chosen.name == case.recommended.name:
             return found
         verdict = "avoids" if check(case, case.recommended) is None else "does not avoid"
-        return replace(found, remedy=f"{found.remedy} On this log named('uard') {verdict} it.")
+        return replace(found, remedy=f"{found.remedy} On this log uard {verdict} it.")
     found = check(case, case.printed)
     if found is None:
         return None
@@ -55,9 +55,9 @@ def smaller_penalties(case: Case, outcome: FilterOutcome) -> Finding | None:
         "pairs with a step that has a higher reward and a higher mean rating, the penalty is paid more.",
         "w < 1 draws a negative reward up to an anchor above it, which is zero as printed: the agent is let off exactly "
         "where people disagree about how bad the step was, and enters a hazard that it would avoid without a filter.",
-        "Draw rewards towards the lowest rating, anchor='lowest', not towards zero (uard-0.1 does). uard has no such anchor: "
-        "look whether raters copy each other, for it takes their agreement for knowledge.",
+        "Draw rewards towards the lowest rating, not towards zero. uard has no such anchor: look whether raters copy each other, for it takes their agreement for knowledge.",
         {"penalties": float(lost.sum()), "largest_gain": float(gain[worst]), "turned": share},
+        how="--mitigation uard-0.1, or anchor='lowest'",
     )
 
 
@@ -85,8 +85,9 @@ def origin_and_unit(case: Case, outcome: FilterOutcome) -> Finding | None:
         f"of rows; if all are multiplied by 0.1, of {percent(flips['scale'])} ({i.size} pairs that differ by over a tenth of a unit).",
         "What the agent prefers then depends on where zero is and on the unit, which carry no meaning: reward "
         "normalisation, another bonus or a rescaled model changes what it learns.",
-        "anchor='lowest' makes the filter indifferent to a shift, standardise=True to the unit.",
+        "Draw rewards towards the lowest rating, which moves along with a shift, and measure doubt in units of the reward.",
         flips,
+        how="anchor='lowest', standardise=True",
     )
 
 
@@ -109,8 +110,9 @@ def lie_still_pays(case: Case, outcome: FilterOutcome) -> Finding | None:
         f"all in {case.place(worst)}: reward {case.reward[worst]:.3g}, ratings {case.feedback.mean[worst]:.3g} ± "
         f"{case.feedback.sd[worst]:.2g}, paid {outcome.learned[worst]:.3g}.",
         "The discount is too small to change which action is best: the agent still goes where the reward lies.",
-        "Let lambda rise where disagreement stands out (kappa > 0) and draw rewards towards the lowest rating.",
+        "Let the discount grow where disagreement stands out, and draw rewards towards the lowest rating.",
         {"rows": float(contested.sum()), "overpaid": float(extra.mean()), "kept": kept},
+        how="kappa > 0, anchor='lowest'",
     )
 
 
@@ -129,8 +131,9 @@ def saturated(case: Case, outcome: FilterOutcome) -> Finding | None:
             f"{weights}: nothing is believed.",
             "The agent learns from the anchor alone; honest steps are discounted like lies, and with an anchor of zero "
             "there is nothing left to learn.",
-            "Measure sigmas in units of the reward (standardise=True), or lower lam; of uard, which has neither, lower lies.",
+            "Measure doubt in units of the reward, or doubt less. Of uard, which has no unit of its own, lower the prior share of lies.",
             numbers,
+            how="standardise=True, or a lower lam; of uard a lower lies",
         )
     if low > 0.9 and disagreement > 0.5:
         return Finding(
@@ -138,9 +141,8 @@ def saturated(case: Case, outcome: FilterOutcome) -> Finding | None:
             "warning",
             f"{weights}: everything is believed, though raters disagree by up to {disagreement:.2g} units (95 % of rows).",
             "The filter does nothing: it costs ratings and protects no more than the raw reward.",
-            "Measure sigmas in units of the reward (standardise=True), or raise lam. uard has neither: it takes what "
-            "raters differ by for their noise, which is right if they are noisy. If raters disagree about all rows alike, "
-            "no filter can tell the rows apart: give the raters clearer instructions.",
+            "Measure doubt in units of the reward, or doubt more. uard has no such setting: it takes what raters differ by for their noise, which is right if they are noisy. If raters disagree about all rows alike, no filter can tell the rows apart: give the raters clearer instructions.",
             numbers,
+            how="standardise=True, or a higher lam",
         )
     return None

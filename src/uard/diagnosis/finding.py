@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from uard._support.columns import WIDTH, fill
 from uard.ratings.raters import EffectiveRaters
 
 Severity = Literal["danger", "warning", "note"]
@@ -29,6 +29,7 @@ class Finding:
         consequence: What it would do to training.
         remedy: What avoids it.
         numbers: The numbers of the evidence, by name.
+        how: The option or the line of Python that does it; empty if there is none.
     """
 
     code: str
@@ -37,6 +38,7 @@ class Finding:
     consequence: str
     remedy: str
     numbers: Mapping[str, float] = field(default_factory=dict[str, float])
+    how: str = ""
 
 
 @dataclass(frozen=True)
@@ -119,36 +121,45 @@ class Diagnosis:
         return data | {name: list(data[name]) for name in ("raters", "strata", "findings")}
 
     def __str__(self) -> str:
-        """Return the whole diagnosis as text, 100 columns wide."""
+        """Return the whole diagnosis as text, 80 columns wide."""
+        return self.text()
+
+    def text(self, width: int = WIDTH) -> str:
+        """Return the whole diagnosis as text.
+
+        Args:
+            width: Of the longest line, unless a word is longer.
+        """
         who = f"{len(self.raters)} rater{'s' * (len(self.raters) != 1)}"
         names = f" ({', '.join(self.raters)})" if 0 < len(self.raters) <= 8 else ""
-        lines = [f"{self.source}: {row_count(self.rows)}, {who}{names}, {percent(self.rated)} of rows rated"]
-        alpha = "not defined (fewer than two ratings of anything, or all ratings equal)"
-        if self.agreement is not None:
-            between = interval(*self.agreement_interval or (None, None))
-            alpha = f"{self.agreement:z.3f} ({between}1 perfect, 0 chance; below 0.667 by custom too low to rely on)"
-        lines.append(f"agreement   Krippendorff's alpha {alpha}")
-        for s in self.strata:
-            alpha = "not defined" if s.agreement is None else f"{s.agreement:z.3f}"
-            lines.append(f"            within {s.name}: {alpha} ({interval(s.low, s.high)}{row_count(s.rows)})")
-        if (i := self.independence) is not None:
-            errors = "their errors" if i.against == "true_reward" else "what the reward misses, error or truth,"
-            lines.append(
-                f"raters      a row's {i.raters:.3g} are worth {i.number:.3g} independent ones (mean correlation of "
-                f"{errors} {i.correlation.value:.2f})"
-            )
-        for sigma, values in (self.calibration or {}).items():
-            shown = ", ".join(f"{name} {value:.3f}" for name, value in values.items())
-            lines.append(f"calibration {sigma.replace('_with_proxy', ' with the reward as a rater')}: {shown}")
-        lines.append(f"filter      {self.mitigation}")
+        head = f"{self.source}: {row_count(self.rows)}, {who}{names}, {percent(self.rated)} of rows rated"
+        lines = [fill(head, width, rest="  ")]
+        lines += [fill(said, width, f"{name:12}") for name, said in self._facts()]
         for f in self.findings:
             lines += ["", f"{f.severity.upper():8}{f.code}"]
-            for name in ("evidence", "consequence", "remedy"):
-                lines.append(
-                    textwrap.fill(getattr(f, name), 100, initial_indent=f"  {name:12}", subsequent_indent=14 * " ")
-                )
+            told = {"evidence": f.evidence, "consequence": f.consequence, "remedy": f.remedy, "how": f.how}
+            lines += [fill(said, width, f"  {name:12}") for name, said in told.items() if said]
         found = ", ".join(f"{self.count(s)} {s}" for s in SEVERITIES if self.count(s))
         return "\n".join([*lines, "", f"findings: {found or 'none'}"])
+
+    def _facts(self) -> list[tuple[str, str]]:
+        """Return what is known of the log beside the findings: a word, and a text."""
+        alpha = "not defined (fewer than two ratings of anything, or all ratings equal)"
+        if self.agreement is not None:
+            ends = interval(*self.agreement_interval or (None, None))
+            alpha = f"{self.agreement:z.2f}{ends} (1 perfect, 0 chance; below 0.67 by custom too low to rely on)"
+        facts = [("agreement", f"Krippendorff's alpha {alpha}")]
+        for s in self.strata:
+            alpha = "not defined" if s.agreement is None else f"{s.agreement:z.2f}{interval(s.low, s.high)}"
+            facts.append(("", f"within {s.name}: {alpha} ({row_count(s.rows)})"))
+        if (i := self.independence) is not None:
+            errors = "their errors" if i.against == "true_reward" else "what the reward misses, error or truth,"
+            worth = f"a row's {i.raters:.3g} are worth {i.number:.3g} independent ones"
+            facts.append(("raters", f"{worth} (mean correlation of {errors} {i.correlation.value:.2f})"))
+        for sigma, values in (self.calibration or {}).items():
+            shown = ", ".join(f"{name} {value:.3f}" for name, value in values.items())
+            facts.append(("calibration", f"{sigma.replace('_with_proxy', ' with the reward as a rater')}: {shown}"))
+        return [*facts, ("filter", self.mitigation)]
 
 
 def percent(share: float) -> str:
@@ -158,8 +169,8 @@ def percent(share: float) -> str:
 
 
 def interval(low: float | None, high: float | None) -> str:
-    """Return a 95 % interval as the beginning of a text: ``95 %: 0.71 to 0.83; ``; nothing if there is none."""
-    return "" if low is None or high is None else f"95 %: {low:.2f} to {high:.2f}; "
+    """Return a 95 % interval as the end of a number: `` [0.71, 0.83]``; nothing if there is none."""
+    return "" if low is None or high is None else f" [{low:z.2f}, {high:z.2f}]"
 
 
 def listed(parts: Iterable[str], most: int = 8) -> str:

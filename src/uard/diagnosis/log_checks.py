@@ -32,8 +32,9 @@ def not_finite(log: RatingLog) -> Finding | None:
         f"NaN, infinite or beyond {LARGEST:g}: {'; '.join(parts)}.",
         "One NaN reward makes every mean, target and gradient that it enters NaN, often without any message; an infinite "
         "rating makes sigma_h and the anchor infinite. These rows and cells are left out of everything below.",
-        "Drop these rows, or mark missing ratings as missing (sigma_human(ratings, mask=...)); find out what wrote them.",
+        "Drop these rows, and leave cells without a rating empty; find out what wrote these numbers.",
         numbers,
+        how="sigma_human(ratings, mask=np.isfinite(ratings))",
     )
 
 
@@ -46,7 +47,8 @@ def no_rewards(case: Case) -> Finding | None:
         "note",
         "The log has no column of rewards, so only what concerns the raters alone was checked.",
         "Whether raters contradict the reward, and what a filter would make of it, is not known.",
-        "Name the column of rewards (--reward), or add one: a row of the export then says what was observed for its item.",
+        "Name the column of rewards, or add one: a row of the export then says what was observed for its item.",
+        how="--reward COLUMN",
     )
 
 
@@ -58,7 +60,7 @@ def few_ratings(case: Case) -> Finding | None:
             "no-ratings",
             "danger",
             f"None of {len(case.reward)} rows has a rating.",
-            "Without ratings uard only scales the reward, and protects from nothing; sigma_m alone hardly sees a lie.",
+            "Without ratings uard only scales the reward, and protects from nothing; a model's own doubt hardly sees a lie.",
             "Have at least two people rate a sample of steps, those with the highest rewards first.",
             {"rated_rows": 0.0},
         )
@@ -70,8 +72,9 @@ def few_ratings(case: Case) -> Finding | None:
         f"{rated} of {len(case.reward)} rows are rated ({percent(share)}).",
         "A reward that nobody has rated is believed in part (uard: a twentieth) or wholly (the filter as printed), however high "
         f"it is; and with fewer than {FEW} rated rows the numbers here mean little.",
-        "Rate more, the highest rewards first; with few ratings of one noisy rater named('lcb') does better than uard.",
+        "Rate more, the highest rewards first; with few ratings of one noisy rater the cautious mean of the ratings does better than uard.",
         {"rated_rows": float(rated), "rated_share": share},
+        how="--mitigation lcb, or named('lcb')",
     )
 
 
@@ -103,10 +106,11 @@ def missing_ratings(case: Case) -> Finding | None:
         "missing-ratings",
         "warning" if missing > 0.05 else "note",
         evidence + ".",
-        "A NaN that is averaged makes sigma_h and the anchor NaN; with fewer raters on a row sigma_h is smaller, so gaps look "
-        "like agreement; and a lie that nobody rated is hardly doubted.",
-        "Pass a mask: sigma_human(ratings, mask=np.isfinite(ratings), empty=...); ask for the missing ratings.",
+        "An average over a gap is no number, and neither is what is learned from it; with fewer raters on a row they seem to "
+        "differ less, so gaps look like agreement; and a lie that nobody rated is hardly doubted.",
+        "Ask for the missing ratings. In your own code, say which ratings are there instead of averaging over gaps; uard does so by itself.",
         numbers,
+        how="sigma_human(ratings, mask=np.isfinite(ratings), empty=...)",
     )
 
 

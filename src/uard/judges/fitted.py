@@ -6,9 +6,12 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
+from uard._support.columns import WIDTH, fill
+from uard._support.columns import text as columns_text
 from uard.judges.panel import FittedJudge, JudgePanel
 from uard.judges.rules import name_of_rule
-from uard.ratings.raters import EffectiveRaters, PanelSummary, RaterSummary, columns_of_text
+from uard.ratings.jackknife import Estimate, texts
+from uard.ratings.raters import EffectiveRaters, PanelSummary, RaterSummary
 
 FEW = 100  # completions, below which a scale is rough
 LEGEND = """\
@@ -117,25 +120,32 @@ class Fitted(NamedTuple):
         }
 
     def __str__(self) -> str:
-        """Return a table, and what stands out."""
-        head = ("judge", "missing", "location", "scale", "bias", "own view", "with others", "")
-        rows = [
-            (
-                judge.name,
-                f"{100 * judge.missing:.0f} %",
-                f"{judge.location:.4g}",
-                f"{judge.scale:.4g}",
-                f"{judge.bias:+.2f}",
-                f"{judge.idiosyncrasy**0.5:.2f}",
-                "?" if told.with_others is None else f"{told.with_others:.2f}",
-                "; ".join(self.words_of(judge)),
-            )
-            for judge, told in zip(self.panel.judges, self.summary.raters, strict=True)
-        ]
+        """Return a table, and what stands out, 80 columns wide."""
+        return self.text()
+
+    def text(self, width: int = WIDTH) -> str:
+        """Return a table, and what stands out.
+
+        Args:
+            width: Of the longest line, unless a word is longer.
+        """
+        judges, others = self.panel.judges, [r.with_others for r in self.summary.raters]
+        columns = {
+            "judge": [j.name for j in judges],
+            "missing": [f"{100 * j.missing:.0f} %" for j in judges],
+            "location": texts([Estimate(j.location) for j in judges]),
+            "scale": texts([Estimate(j.scale) for j in judges]),
+            "bias": [f"{j.bias:+.2f}" for j in judges],
+            "own view": [f"{j.idiosyncrasy**0.5:.2f}" for j in judges],
+            "with others": ["?" if e is None else f"{e:z.2f}" for e in others],
+        }
         how = f"rule {name_of_rule(self.panel.rule)}, proxy {self.panel.proxy}"
-        count = f"{self.source}: {self.panel.completions} completions, {len(rows)} judges; {how}"
-        table = columns_of_text([head, *rows])
-        return "\n".join([count, *table, LEGEND, self._worth(), *(f"! {w}" for w in self.warnings())])
+        count = f"{self.source}: {self.panel.completions} completions, {len(judges)} judges; {how}"
+        table = columns_text([*columns], zip(*columns.values(), strict=True), width)
+        words = {j.name: self.words_of(j) for j in judges}
+        notes = [f"{name}: {'; '.join(several)}" for name, several in words.items() if several]
+        notes += [*LEGEND.split("\n"), self._worth(), *(f"! {w}" for w in self.warnings())]
+        return "\n".join([fill(count, width, rest="  "), table, *(fill(x, width, rest="  ") for x in notes)])
 
     def _told(self, judge: FittedJudge) -> RaterSummary:
         return next(rater for rater in self.summary.raters if rater.name == judge.name)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+
+from uard._support.columns import decimals
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Integer, Shaped
@@ -28,11 +30,28 @@ class Estimate(NamedTuple):
     high: float | None = None
 
     def __format__(self, spec: str) -> str:
-        """Return it as text, each number by ``spec``: ``1.20 (0.90 to 1.50)``."""
+        """Return it as text, each number by ``spec``: ``1.20 [0.90, 1.50]``."""
         value = format(self.value, spec)
         if self.low is None or self.high is None:
             return value
-        return f"{value} ({format(self.low, spec)} to {format(self.high, spec)})"
+        return f"{value} [{format(self.low, spec)}, {format(self.high, spec)}]"
+
+
+def texts(estimates: Sequence[Estimate | None], sign: str = "") -> list[str]:
+    """Return a column of estimates with equal precision; ``?`` where nothing is known.
+
+    Examples:
+        >>> texts([Estimate(8.021, 7.98, 8.049), None, Estimate(-0.5)])
+        ['8.02 [7.98, 8.05]', '?', '-0.50']
+
+    Args:
+        estimates: Of one quantity.
+        sign: ``+`` where a plus is to be written: of a difference.
+    """
+    known = [e for e in estimates if e is not None]
+    widths = [e.high - e.low for e in known if e.low is not None and e.high is not None]
+    spec = f"{sign}z.{decimals((e.value for e in known), widths)}f"
+    return ["?" if e is None else format(e, spec) for e in estimates]
 
 
 def jackknife(
@@ -69,7 +88,7 @@ def interval(value: float, error: float, units: int) -> Estimate | None:
 
     Examples:
         >>> f"{interval(3.0, 0.7071, units=5):.2f}"
-        '3.00 (1.04 to 4.96)'
+        '3.00 [1.04, 4.96]'
 
     Args:
         value: NaN where it is not defined.

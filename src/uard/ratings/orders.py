@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uard import _checks
+from uard._support.columns import WIDTH, fill
+from uard._support.columns import text as columns_text
 from uard.method import pooled
 from uard.method.feedback import ByRater
 from uard.method.mitigations.pooled import PooledDiscounting
@@ -22,7 +24,6 @@ from uard.method.rater_statistics import masked_median
 from uard.ratings.jackknife import Estimate, interval, jackknife
 from uard.ratings.log import RatingLog
 from uard.ratings.rater_estimates import Answers, PanelEstimates, answers_of
-from uard.ratings.raters import columns_of_text
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Integer, Shaped
@@ -98,25 +99,29 @@ class Orders:
         return asdict(self) | {"rows": [plain(row) for row in self.rows]}
 
     def __str__(self) -> str:
-        """Return a table."""
+        """Return a table, 80 columns wide."""
+        return self.text()
+
+    def text(self, width: int = WIDTH) -> str:
+        """Return a table.
+
+        Args:
+            width: Of the longest line, unless a word is longer.
+        """
         pairs = "pairs of items" if self.within is None else f"pairs of one {self.within}"
         title = f"share of {pairs} that a rule puts in the order of a rater's {self.own} (1/2 by chance)"
-        head = ("rule", "rater", "pairs", "without the rater (95 %)", "tau", "with the rater", "")
-        rows = [
-            (
-                r.rule,
-                r.rater,
-                str(r.pairs),
-                "?" if r.alike is None else f"{r.alike:.3f}",
-                "?" if r.tau is None else f"{r.tau.value:z.2f}",
-                "?" if r.with_own is None else f"{r.with_own:.3f}",
-                "",
-            )
-            for r in self.rows
-        ]
-        return "\n".join(
-            [title, *columns_of_text([head, *rows])] if rows else [f"{title}: no pair that a rater tells apart"]
-        )
+        if not self.rows:
+            return fill(f"{title}: no pair that a rater tells apart", width, rest="  ")
+        columns = {
+            "rule": [r.rule for r in self.rows],
+            "rater": [r.rater for r in self.rows],
+            "pairs": [str(r.pairs) for r in self.rows],
+            "without the rater [95 %]": ["?" if r.alike is None else f"{r.alike:.3f}" for r in self.rows],
+            "tau": ["?" if r.tau is None else f"{r.tau.value:z.2f}" for r in self.rows],
+            "with the rater": ["?" if r.with_own is None else f"{r.with_own:.3f}" for r in self.rows],
+        }
+        table = columns_text([*columns], zip(*columns.values(), strict=True), width, labels=2)
+        return f"{fill(title, width, rest='  ')}\n{table}"
 
 
 def orders(

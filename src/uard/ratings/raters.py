@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from uard import _checks
+from uard._support.columns import WIDTH, fill
+from uard._support.columns import text as columns_text
 from uard.method.rater_statistics import LOUDEST
 from uard.ratings.agreement import independence
-from uard.ratings.jackknife import GROUPS, Estimate, interval, jackknife
+from uard.ratings.jackknife import GROUPS, Estimate, interval, jackknife, texts
 from uard.ratings.log import RatingLog
 from uard.ratings.pairs import equal_share, line_between
 from uard.ratings.rater_estimates import REPEATS, Answers, PanelEstimates, answers_of, sample_of_items
@@ -153,25 +155,37 @@ class PanelSummary:
         return data | {"raters": list(data["raters"])}
 
     def __str__(self) -> str:
-        """Return a table, and what is known of all raters together."""
-        head = ("rater", "answers", "noise (95 %)", "bias (95 %)", "idiosyncrasy", "with others", "heard", "")
-        rows = [
-            (
-                r.name,
-                str(r.answers),
-                _shown(r.noise, "z.3g") + ("" if r.noise_from in ("repeats", "nothing") else f" *{r.noise_from[0]}"),
-                _shown(r.bias, "+z.3g"),
-                "?" if r.idiosyncrasy is None else f"{r.idiosyncrasy:.3g}",
-                _shown(r.with_others, "z.2f"),
-                "yes" if r.heard else f"no: {r.why}",
-                "; ".join(r.words),
-            )
-            for r in self.raters
-        ]
-        several = f"{len(self.raters)} rater{'s' * (len(self.raters) != 1)}"
+        """Return a table, and what is known of all raters together, 80 columns wide."""
+        return self.text()
+
+    def text(self, width: int = WIDTH) -> str:
+        """Return a table, and what is known of all raters together.
+
+        Args:
+            width: Of the longest line, unless a word is longer.
+        """
+        told = self.raters
+        marks = [f" *{r.noise_from[0]}" if r.noise_from not in ("repeats", "nothing") else "" for r in told]
+        of_noise, of_bias = texts([r.noise for r in told]), texts([r.bias for r in told], "+")
+        own = [None if r.idiosyncrasy is None else Estimate(r.idiosyncrasy) for r in told]
+        columns = {
+            "rater": [r.name for r in told],
+            "answers": [str(r.answers) for r in told],
+            "noise [95 %]": [f"{x}{mark}" for x, mark in zip(of_noise, marks, strict=True)],
+            "bias [95 %]": of_bias,
+            "idiosyncrasy": texts(own),
+            "with others": ["?" if r.with_others is None else f"{r.with_others:z.2f}" for r in told],
+        }
+        several = f"{len(told)} rater{'s' * (len(told) != 1)}"
         title = f"{self.source}: {self.items} items, {several}, {self.answers} answers; bias is against {self.against}"
-        notes = [text for letter, text in _NOTES.items() if any(r.noise_from[0] == letter for r in self.raters)]
-        return "\n".join([title, *columns_of_text([head, *rows]), *notes, self._worth()])
+        notes = [text for letter, text in _NOTES.items() if f" *{letter}" in marks]
+        for r in told:
+            words = [*r.words, *([f"not heard: {r.why}"] if not r.heard else [])]
+            notes += [f"{r.name}: {'; '.join(words)}"] if words else []
+        table = columns_text([*columns], zip(*columns.values(), strict=True), width)
+        return "\n".join(
+            [fill(title, width, rest="  "), table, *(fill(x, width, rest="  ") for x in [*notes, self._worth()])]
+        )
 
     def _worth(self) -> str:
         if self.effective is None:
@@ -190,29 +204,8 @@ _NOTES = {
 }
 
 
-def columns_of_text(rows: list[tuple[str, ...]]) -> list[str]:
-    """Return a table as lines, the first column beginning at the left, like the last one.
-
-    Examples:
-        >>> columns_of_text([("a", "n", ""), ("ann", "12", "noisy")])
-        ['a     n', 'ann  12  noisy']
-    """
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    last = len(widths) - 1
-    return [
-        "  ".join(
-            x.ljust(w) if i in (0, last) else x.rjust(w) for i, (x, w) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
-
-
 def _plain(estimate: Estimate | None) -> dict[str, Any] | None:
     return None if estimate is None else estimate._asdict()
-
-
-def _shown(estimate: Estimate | None, spec: str) -> str:
-    return "?" if estimate is None else format(estimate, spec)
 
 
 def summary(log: RatingLog) -> PanelSummary:
@@ -418,7 +411,7 @@ def effective_raters(
         >>> truth, mistake = random.normal(size=(2, 500))
         >>> ratings = (truth + mistake)[:, None] + random.normal(size=(500, 3))
         >>> f"{effective_raters(ratings, truth, 'true_reward').number:.1f}"
-        '1.5 (1.4 to 1.6)'
+        '1.5 [1.4, 1.6]'
 
     Args:
         ratings: A column per rater, NaN where one is missing.
