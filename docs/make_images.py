@@ -1,7 +1,7 @@
 """Draws the pictures that README and docs show, from real runs: ``python docs/make_images.py [walks regret ...]``.
 
-``regret``, ``robots`` and ``judges`` read published results, ``walks`` trains a few seconds, and ``people`` needs
-Playwright and a Chromium (``CHROMIUM`` names another one), and MuJoCo. All need Pillow.
+``regret``, ``robots`` and ``judges`` read published results, ``walks`` and ``paper`` train for some seconds, and
+``people`` needs Playwright and a Chromium (``CHROMIUM`` names another one), and MuJoCo. All need Pillow.
 """
 
 import io
@@ -109,7 +109,9 @@ def _walk(axis: Axes, path: np.ndarray, grid: Any, colour: str) -> None:
         ((size - 1, size - 1), "goal", "uard"),
     ]:
         axis.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, color=COLOURS[colour_of], alpha=0.18, lw=0))
-        place = (column + 0.65, "left") if word == "trap" else (column + 0.4, "right")
+        beside = [counts[row, column + 1 : column + 3].any(), counts[row, max(column - 2, 0) : column].any()]
+        right = word == "trap" and (not beside[0] or beside[1])  # where nobody walks
+        place = (column + 0.6, "left") if right else (column - 0.6, "right")
         how: Any = {"va": "center", "fontsize": 9, "color": COLOURS[colour_of], "weight": "bold"}
         axis.text(place[0], row, word, ha=place[1], **how)
     rows, columns = np.divmod(path, size)
@@ -119,6 +121,34 @@ def _walk(axis: Axes, path: np.ndarray, grid: Any, colour: str) -> None:
         row = int(np.argwhere(counts == most)[0, 0])
         column = int(np.argwhere(counts > 2)[:, 1].max())  # beside all that is visited again and again
         axis.text(column + 0.7, row, f"{most} times", va="center", fontsize=10, weight="bold", color=INK)
+
+
+def paper() -> None:
+    """Train ten seeds of the paper's grid and draw what its headline says beside what it does not say."""
+    known = numbers()
+    results = known["paper_results"]()
+    agents = {
+        "Q-learning": ("Q-learning on the raw reward", "raw"),
+        "a random walk": ("a random walk", "true"),
+        "UARD as printed": ("`uard-paper`, as printed", "mean"),
+        "uard": ("`uard`", "uard"),
+    }
+    found = {label: known["paper_row"](results, name, "main") for label, (name, _) in agents.items()}
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7.6, 2.7), layout="constrained")
+        for axis, metric, title in zip(
+            figure.subplots(1, 2, sharey=True), (0, 1), ("trap visits", "goal rate"), strict=True
+        ):
+            for i, (label, (_, colour)) in enumerate(agents.items()):
+                mean = found[label][metric].mean
+                axis.barh(i, mean, 0.62, color=COLOURS[colour])
+                axis.annotate(f"{mean:.2f}", (mean, i), (4, 0), textcoords="offset points", va="center", fontsize=10.5)
+            axis.set_title(title, loc="left", fontsize=11.5, weight="bold")
+            axis.margins(x=0.2)
+        axis.set_yticks(range(len(agents)), list(agents))
+        axis.invert_yaxis()
+        figure.supxlabel("per episode, mean of ten seeds, 10x10", fontsize=10.5, color=SOFT)
+        save(figure, "paper.png")
 
 
 def regret() -> None:
@@ -246,7 +276,7 @@ def people() -> None:
             browser = play.chromium.launch(
                 executable_path=os.environ.get("CHROMIUM", "/usr/bin/chromium"), args=["--no-sandbox"]
             )
-            rater = browser.new_page(viewport={"width": 1000, "height": 860})
+            rater = browser.new_page(viewport={"width": 1000, "height": 740})
             rater.goto(told["cyd"])
             rater.get_by_role("button").first.click()
             rater.wait_for_url("**/rate")
@@ -268,6 +298,6 @@ def people() -> None:
 
 
 if __name__ == "__main__":
-    known = {"walks": walks, "regret": regret, "robots": robots, "judges": judges, "people": people}
+    known = {"walks": walks, "paper": paper, "regret": regret, "robots": robots, "judges": judges, "people": people}
     for name in sys.argv[1:] or known:
         known[name]()

@@ -74,9 +74,10 @@ def fixed(x: float, digits: int) -> str:
     return f"{round(x, digits) + 0.0:.{digits}f}"
 
 
-def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table; all columns but the first are numbers."""
-    lines = [columns, ["---", *["---:"] * (len(columns) - 1)], *rows]
+def table(columns: Sequence[str], rows: Sequence[Sequence[str]], words: Sequence[str] = ()) -> str:
+    """Return a Markdown table; all columns but the first are numbers, and those of these names."""
+    sides = ["---" if i == 0 or name in words else "---:" for i, name in enumerate(columns)]
+    lines = [columns, sides, *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
@@ -206,10 +207,9 @@ def _choices(these: Regrets, first: str, groups: Mapping[str, np.ndarray]) -> st
     rows = []
     for c in choice.choices(these, groups):
         apart = "–" if c.simplest in (OURS, None) else "yes" if c.told_apart else "no"
-        best = f"`{c.best}` {fixed(c.best_regret.mean, 2)}"
-        enough = f"`{c.simplest}`" if c.simplest else "nothing"
-        rows.append((c.kind, str(c.scenarios), enough, shown(c.simplest_regret), shown(c.ours), apart, best))
-    return table((first, "scenarios", "enough", "its regret", "`uard`", "told apart", "least"), rows)
+        enough = f"`{c.simplest}`" if c.simplest else f"nothing; least: `{c.best}`"
+        rows.append((f"{c.kind} ({c.scenarios})", enough, shown(c.simplest_regret), shown(c.ours), apart))
+    return table((first, "enough", "its regret", "`uard`", "told apart"), rows, ("enough", "told apart"))
 
 
 def _kinds(these: Regrets) -> str:
@@ -256,9 +256,8 @@ def choose_judges() -> str:
             told = [which[k][0].row["rule"] for k in here if family.adjusted[k] < statistics.LEVEL]
             found = fixed(float(np.median([family.detectable[k] for k in here])), 2)
             rows.append((f"{condition}, {place}", mean, ours, listed(told) if told else "none", found))
-    return table(
-        ("judges", "mean of judges", "`uard`", "told apart from `uard`", "difference that would be found"), rows
-    )
+    told_apart = "told apart from `uard`"
+    return table(("judges", "mean of judges", "`uard`", told_apart, "would be found"), rows, (told_apart,))
 
 
 def choose_robots() -> str:
@@ -274,7 +273,8 @@ def choose_robots() -> str:
         told = [f"`{rivals[i]['mitigation']}` ({_way(family, i)})" for i in family.found]
         numbers = (shown(p.of(r, "true_return"), 0) for r in (mean, ours))
         rows.append((s.name, *numbers, ", ".join(told) or "none"))
-    return table(("robot", "mean of the ratings", "`uard`", "told apart from `uard`"), rows)
+    told_apart = "told apart from `uard`"
+    return table(("robot", "mean of the ratings", "`uard`", told_apart), rows, (told_apart,))
 
 
 def _way(family: Family, i: int) -> str:
@@ -287,7 +287,7 @@ def _way(family: Family, i: int) -> str:
 def _renamed(names: Mapping[str, str]) -> str:
     """Return old and new names, but for those that nobody outside could have used."""
     known = {old: new for old, new in names.items() if not re.search(r"(^|\.)_", old)}
-    return table(("was", "is"), [(f"`uard.{old}`", f"`uard.{new}`") for old, new in known.items()])
+    return table(("was", "is"), [(f"`uard.{old}`", f"`uard.{new}`") for old, new in known.items()], ("is",))
 
 
 def moved_modules() -> str:
@@ -342,7 +342,7 @@ def paper() -> str:
         rows.append(
             (name, panel, *(f"{fixed(s.mean, n)} ± {fixed(s.sd, n)}" for s, n in zip(found, (2, 2, 1), strict=True)))
         )
-    return table(("agent", "panel", "trap visits", "goal rate", "true return"), rows)
+    return table(("agent", "panel", "trap visits", "goal rate", "true return"), rows, ("panel",))
 
 
 def ten_minutes() -> str:
