@@ -111,14 +111,15 @@ def not_better() -> str:
     parts = []
     if everywhere:
         verb = "is" if len(everywhere) == 1 else "are"
-        parts.append(f"{listed(_by_simplicity(everywhere))} {verb} told apart from `uard` in no column")
+        parts.append(f"{listed(_by_simplicity(everywhere))} {verb} different from `uard` beyond noise in no column")
     for these, same in zip(regrets(), (first, *others), strict=True):
         if more := _by_simplicity(same - everywhere):
             parts.append(f"on {TASKS[these.tasks]} neither {'is' if len(more) == 1 else 'are'} {listed(more)}")
     for these, c in _each_choice():
         if c.told_apart and c.simplest != OURS:
+            who = WORDS[c.kind].replace("some ", "some raters ").replace("all ", "all raters ")
             parts.append(
-                f"on {TASKS[these.tasks]} where {WORDS[c.kind]} `{c.simplest}` is better, {shown(c.simplest_regret)} "
+                f"on {TASKS[these.tasks]} where {who} `{c.simplest}` is better, {shown(c.simplest_regret)} "
                 f"against {shown(c.ours)}"
             )
     return f"**Where it is not better:** {'; '.join([*parts, lost()])}."
