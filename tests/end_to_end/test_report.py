@@ -213,11 +213,7 @@ def test_what_a_reader_of_the_paper_sees_first(page):
     assert [r.split("\t")[:2] for r in rows] == [
         ["baseline", "–"],
         ["random walk", "–"],
-        *(
-            [a, p]
-            for a in ("uard-paper", "uard-consistent", "uard-0.1", "uard")
-            for p in ("main", "appendix")
-        ),
+        *([a, p] for a in ("uard-paper", "uard-consistent", "uard-0.1", "uard") for p in ("main", "appendix")),
     ]
     assert "2 seeds per cell" in page.locator(".meta").first.inner_text()
 
