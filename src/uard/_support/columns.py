@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 import re
-import textwrap
 import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -96,16 +95,14 @@ def fill(written: str, width: int = WIDTH, first: str = "", rest: str | None = N
 
 
 def _broken(written: str, width: int, first: str = "", rest: str = "") -> list[str]:
-    tied = re.sub(r"(?<=\d) (?=%)", _TIE, written)  # no line begins with a percent sign
-    made = textwrap.wrap(
-        tied,
-        max(1, width),
-        initial_indent=first,
-        subsequent_indent=rest,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
-    return [line.replace(_TIE, " ") for line in made]
+    lines: list[str] = []
+    line, empty = first, True
+    for word in re.sub(r"(?<=\d) (?=%)", _TIE, written).split():  # no line begins with a percent sign
+        if not empty and width_of(line) + 1 + width_of(word) > width:
+            lines.append(line)
+            line, empty = rest, True
+        line, empty = f"{line}{word}" if empty else f"{line} {word}", False
+    return [x.replace(_TIE, " ") for x in (*lines, line)] if not empty else []
 
 
 def shorten(written: str, width: int) -> str:
