@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import Annotated, Any
+from types import NoneType
+from typing import Annotated, Any, cast, get_args
 
 from tyro.conf import UseAppendAction, arg
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
@@ -23,10 +24,17 @@ def numbers() -> ConstructorRegistry:
     registry = ConstructorRegistry()
 
     @registry.primitive_rule
-    def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-        if info.type not in (int, float):
+    def _text(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+        if {*get_args(info.type)} != {str, NoneType}:
             return None
-        kind: Any = info.type
+        return PrimitiveConstructorSpec(1, "STR", lambda texts: texts[0], _text_or_none, lambda v: [str(v)])
+
+    @registry.primitive_rule
+    def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+        kinds = {*get_args(info.type)} - {NoneType} or {info.type}  # what is left out is None
+        if kinds not in ({int}, {float}) or not ({*get_args(info.type)} <= {int, float, NoneType}):
+            return None
+        (kind,) = cast(set[Any], kinds)
         metavar, allowed = ("INT", "a whole number") if kind is int else ("FLOAT", "a number")
 
         def read(texts: list[str]) -> Any:
@@ -37,9 +45,16 @@ def numbers() -> ConstructorRegistry:
                 pass
             raise ValueError(f"{_checks.short(texts[0])} must be {allowed}")
 
-        return PrimitiveConstructorSpec(1, metavar, read, lambda value: isinstance(value, kind), lambda v: [str(v)])
+        def fits(value: Any) -> bool:
+            return isinstance(value, kind) or (value is None and kind is not info.type)
+
+        return PrimitiveConstructorSpec(1, metavar, read, fits, lambda v: [str(v)])
 
     return registry
+
+
+def _text_or_none(value: Any) -> bool:
+    return value is None or isinstance(value, str)
 
 
 def settings(pairs: tuple[str, ...], option: str = "--set") -> dict[str, Any]:
