@@ -353,8 +353,29 @@ def _fit(
     layers, optimiser = jax.tree.map(
         lambda new, old: jnp.where(filled > 0, new, old), carry, (model.layers, model.optimiser)
     )
-    apart = location + scale * _predict(spec, layers, model.prior, _normal(model, inputs)).mean(0) - targets
+    return model._replace(
+        layers=layers, optimiser=optimiser, noise=_noise(spec, model, layers, inputs, targets, here, filled)
+    )
+
+
+BLOCK = 1024  # rows that are looked at together: of a sample that is still small, few
+
+
+def _noise(
+    spec: TransitionModel, model: Model, layers: Any, inputs: Array, targets: Array, here: Array, filled: Array
+) -> Array:
+    """Return how far each rater's answers lie from their predictions, a variance (K,); -1 where there are none."""
+    rows, raters = inputs.shape[0], here.shape[1] - 1
+    size = min(BLOCK, rows)
+
+    def body(i: Array, sums: Array) -> Array:
+        start = jnp.minimum(i * size, rows - size)  # the last block overlaps the one before
+        new = (start + jnp.arange(size) >= i * size)[:, None]
+        block, target, known = (lax.dynamic_slice_in_dim(x, start, size) for x in (inputs, targets, here))
+        out = _predict(spec, layers, model.prior, _normal(model, block)).mean(0)
+        apart = model.location + model.scale * out - target
+        return sums + jnp.where(known & new, apart**2, 0.0)[:, :-1].sum(0)
+
+    square = lax.fori_loop(0, -(-filled // size), body, jnp.zeros(raters, jnp.float32))
     answers = here[:, :-1].astype(jnp.float32).sum(0)
-    square = jnp.where(here[:, :-1], apart[:, :-1] ** 2, 0.0).sum(0)
-    noise = jnp.where(answers > 0, square / jnp.maximum(answers, 1.0), -1.0)
-    return model._replace(layers=layers, optimiser=optimiser, noise=noise)
+    return jnp.where(answers > 0, square / jnp.maximum(answers, 1.0), -1.0)
