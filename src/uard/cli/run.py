@@ -71,6 +71,7 @@ class Run:
         from uard.lab.result import summaries
         from uard.lab.study import results_of
         from uard.ratings.panels import RANDOM, as_panel, composition
+        from uard.training.xla import device_name
 
         _checks.whole("seeds", self.seeds, low=1, high=100_000)
         terminal.check_json(self.json, self.store)
@@ -96,6 +97,7 @@ class Run:
                 "config": cell.config(),
                 "key": cell.key,
                 "version": __version__,
+                "device": device_name(),
             }
             terminal.write_json(answer, self.json)
         if self.json != "-":

@@ -55,6 +55,14 @@ def keep_programs() -> None:
     jax.config.update("jax_compilation_cache_max_size", _MOST)
 
 
+def device_name() -> str:
+    """Return how many devices of which kind JAX computes on: "1 x cpu", or the name of a GPU."""
+    import jax
+
+    devices = jax.devices()
+    return f"{len(devices)} x {devices[0].device_kind}"
+
+
 def _processor() -> str:
     """Return a short name of this kind of processor: its architecture, and a digest of what it can do."""
     try:
