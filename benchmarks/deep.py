@@ -9,7 +9,7 @@ with the smallest and the largest; time is that of the processor, so that what e
 
 *Floor* is the arithmetic over the machine's measured matrix rate: of a network's update; of a rule that listens, the
 measured time of the raw agent and the arithmetic of its model of ratings. *First* is the first call, compilation
-included: programs are kept on disk, and a second run of the benchmark reads them: it then takes about two minutes.
+included: programs are kept on disk, and a second run of the benchmark reads them. The first takes several minutes.
 """
 
 from __future__ import annotations
