@@ -85,6 +85,55 @@ def ours(robot: str, copies: int, steps: int, threads: int) -> Rate:
     return run
 
 
+def alone(robot: str, copies: int, steps: int) -> Rate:
+    """MuJoCo's own steps and nothing else, on one thread: the roof of one core."""
+    import mujoco
+
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, copies, Locomotion(robot).actions))
+    simulator = Locomotion(robot).simulator(copies, 0)
+
+    def run() -> float:
+        model, substeps = simulator._model, simulator.model.substeps
+        for i in range(copies):
+            simulator.reset(i)
+        start = time.perf_counter()
+        for a in actions:
+            for data, controls in zip(simulator._data, a, strict=True):
+                data.ctrl[:] = controls
+                mujoco.mj_step(model, data, substeps)
+        return copies * steps / (time.perf_counter() - start)
+
+    return run
+
+
+def rolled(robot: str, copies: int, steps: int, threads: int) -> Rate:
+    """MuJoCo's own threads (``mujoco.rollout``), a step of all copies at a time, as an agent needs them."""
+    import mujoco
+    from mujoco import rollout
+
+    spec = Locomotion(robot)
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, copies, spec.actions))
+    simulator = spec.simulator(copies, 0)
+    model, substeps = simulator._model, simulator.model.substeps
+    whole = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    begun = np.zeros((copies, mujoco.mj_stateSize(model, whole)))
+    for row, data in zip(begun, simulator._data, strict=True):
+        mujoco.mj_getState(model, data, row, whole)
+    data = [mujoco.MjData(model) for _ in range(threads)]
+
+    def run() -> float:
+        state, warm = begun, np.zeros((copies, model.nv))
+        with rollout.Rollout(nthread=threads) as pool:
+            start = time.perf_counter()
+            for a in actions:
+                controls = np.repeat(a[:, None], substeps, axis=1)
+                states, _ = pool.rollout([model] * copies, data, state, controls, initial_warmstart=warm)
+                state = states[:, -1]
+            return copies * steps / (time.perf_counter() - start)
+
+    return run
+
+
 def shaking(robot: str) -> float:
     """Return the mean root mean square of the joints' accelerations under random actions, rad/s^2."""
     spec, seen = Locomotion(robot), []
@@ -231,6 +280,8 @@ def main() -> None:
                     "Gymnasium's SyncVectorEnv": (sync(robot, copies, steps), 0.0),
                     "ours, 1 thread": (ours(robot, copies, steps, 1), 0.0),
                     f"ours, {cores()} threads": (ours(robot, copies, steps, cores()), 0.0),
+                    f"MuJoCo's rollout, {cores()} threads": (rolled(robot, copies, steps, cores()), 0.0),
+                    "MuJoCo's steps alone, 1 thread": (alone(robot, copies, steps), 0.0),
                 }
     only_core = {max(os.sched_getaffinity(0))} if hasattr(os, "sched_setaffinity") else set()
     if "sac" in arguments.only:

@@ -336,3 +336,16 @@ def test_ratings_with_a_gradient_keep_it():
 def test_thumbs_are_ratings_too():
     feedback = aggregate(np.array([[True, False]]), np.array([1], np.int8))
     assert (feedback.mean, feedback.lowest, feedback.proxy) == (0.5, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("raters", [2, 3, 7, 40])
+def test_a_row_is_the_same_whether_another_lacks_a_rating_or_stands_otherwise_in_memory(raters):
+    draw = np.random.default_rng(raters)
+    ratings, proxy = draw.normal(size=(50, raters)), draw.normal(size=50)
+    some = ratings.copy()
+    some[::4, 0] = np.nan
+    for given in (some, np.asfortranarray(ratings), ratings[:, ::-1][:, ::-1]):
+        whole = aggregate(given, proxy)
+        for i in range(1, 50, 4):
+            alone = aggregate(ratings[[i]], proxy[[i]])
+            assert (whole.mean[i], whole.sd[i], whole.lowest[i]) == (alone.mean[0], alone.sd[0], alone.lowest[0])

@@ -112,7 +112,10 @@ def dot(a: Array, b: Array) -> Array:
         >>> dot(np.array([[1.0, 2.0]]), np.array([[3.0, 4.0]])).tolist()
         [11.0]
     """
-    return np.vecdot(a, b) if type(a) is np.ndarray and type(b) is np.ndarray else (a * b).sum(-1)
+    if type(a) is np.ndarray and type(b) is np.ndarray:
+        # In rows of another layout NumPy adds in another order: a row's number would depend on what stands beside it.
+        return np.vecdot(np.ascontiguousarray(a), np.ascontiguousarray(b))
+    return (a * b).sum(-1)
 
 
 def total(values: Array) -> Array:
@@ -125,7 +128,7 @@ def total(values: Array) -> Array:
     # Of a few numbers a product with ones takes half as long as a reduction.
     if type(values) is not np.ndarray:
         return values.sum(-1)
-    return np.vecdot(values, _ones(values.shape[-1], values.dtype.char))
+    return np.vecdot(np.ascontiguousarray(values), _ones(values.shape[-1], values.dtype.char))
 
 
 @lru_cache(maxsize=64)

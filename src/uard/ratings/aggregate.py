@@ -89,9 +89,11 @@ def _masked(
     raters = xp.sum(here, axis=-1)
     rated = raters > 0
     zero = xp.zeros_like(raters)
-    mean = xp.sum(held, axis=-1) / xp.where(rated, raters, zero + 1.0)
+    # The sums of ``_complete``, to the bit: what a row gives may not depend on whether another row lacks a rating.
+    mean = total(held) / xp.where(rated, raters, zero + 1.0)
     lowest = xp.min(xp.where(mask, ratings, xp.full_like(ratings, np.inf)), axis=-1)
-    square = xp.sum(here * (held - mean[..., None]) ** 2, axis=-1)
+    gap = here * (held - mean[..., None])
+    square = dot(gap, gap)
     enough = raters > max(ddof, 1)
     sd = uncertainty.root(xp.where(enough, square / xp.where(enough, raters - ddof, zero + 1.0), zero))
     by_rater = ByRater(here, held, xp.zeros_like(held))
