@@ -18,8 +18,7 @@ test: $(VENV)/.test
 	$(BIN)/pytest -n 2 --dist worksteal
 
 bench: $(VENV)/.test
-	$(BIN)/python benchmarks/tabular.py
-	$(BIN)/python benchmarks/deep.py
+	$(BIN)/python benchmarks/bench.py
 
 docs: $(VENV)/.test
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
