@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from uard.lab import studies
+from uard.lab.statistics import interval
 from uard.lab.views import published, sections, templates
 from uard.replication.ledger import VERDICTS
 
@@ -133,7 +134,8 @@ def by_hand():
 
 def test_every_number_of_the_first_screen_is_a_stored_result(first):
     regrets = by_hand()
-    tasks = first.locator("#heat thead th[scope=colgroup]").all_inner_texts()
+    tasks = ["random grids", "random MDPs"]
+    assert first.locator("#heat thead th[scope=colgroup]").count() == len(tasks)
     counts = [int(x) for x in first.locator("#heat thead th[scope=col] small").all_inner_texts()]
     half = len(counts) // 2
     rows = first.locator("#heat tbody tr").all_inner_texts()
@@ -149,13 +151,21 @@ def test_every_number_of_the_first_screen_is_a_stored_result(first):
             assert (groups * weights).sum() / weights.sum() == pytest.approx(here.mean(), abs=0.0051)
             assert weights.sum() == here.size
     cards = first.locator(".three b").all_inner_texts()
-    assert cards[0] == " / ".join(f"{100 * np.mean(regrets['uard', t]):.0f} %" for t in tasks)
+
+    def card(name):
+        ends = {t: interval(np.array(regrets[name, t])) for t in tasks}
+        parts = (
+            f"{100 * np.mean(regrets[name, t]):.0f} % [{100 * ends[t][0]:.0f}, {100 * ends[t][1]:.0f}]" for t in tasks
+        )
+        return " / ".join(parts)
+
+    assert cards[0] == card("uard")
     rival = re.search(r"lost with ([\w-]+)", first.locator(".three li").nth(1).inner_text())[1]
-    assert cards[1] == " / ".join(f"{100 * np.mean(regrets[rival, t]):.0f} %" for t in tasks)
+    assert cards[1] == card(rival)
     lost = np.concatenate([regrets["uard", t] for t in tasks]) > 0.25
     assert cards[2] == f"{lost.sum()} of {lost.size}"
     raw = " / ".join(f"{100 * np.mean(regrets['raw', t]):.0f} %" for t in tasks)
-    assert f"{raw} on the raw reward" in first.locator(".three li").nth(0).inner_text()
+    assert f"{raw} with raw" in first.locator(".three li").nth(0).inner_text()
 
 
 def test_the_first_screen_is_a_screen(first):

@@ -27,7 +27,8 @@ def test_how_bad_by_hand():
 @pytest.mark.parametrize(
     ("fields", "says"),
     [
-        ({"p": 0.0004, "of": 96}, "p = 0.0004 of 96 (Holm)"),
+        ({"p": 0.0004, "of": 96}, "p < 0.001 of 96 (Holm)"),
+        ({"p": 0.004, "of": 96}, "p = 0.004 of 96 (Holm)"),
         ({"p": 0.2, "of": 96}, "not told apart, p = 0.2 of 96 (Holm)"),
         ({"p": 0.2}, "not told apart, p = 0.2"),
         ({"p": 0.2, "note": "8 was to be found"}, "not told apart, p = 0.2; 8 was to be found"),

@@ -97,7 +97,7 @@ def hero(results: StudyResults) -> Picture:
         "g3",
         "G3 · the verification delay",
         "See that nothing happens at the dotted line, where the paper's UARD turns to the goal: as printed (uard-paper) it "
-        f"stays flat, and uard turns early. {BANDS}",
+        f"never turns to the goal, and uard turns early. {BANDS}",
         _command(results, "table4"),
     )
 

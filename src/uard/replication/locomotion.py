@@ -16,7 +16,7 @@ from uard.lab.views.figures import Chart, Picture, made_by
 from uard.lab.views.losses import Kind, Loss, of_family
 from uard.lab.views.palette import DASHED, SOLID, look
 from uard.lab.views.published import Published, packaged_json
-from uard.lab.views.tables import Cell, Number, Table, full
+from uard.lab.views.tables import Cell, Number, Table, bounds, full, number
 from uard.replication import figures, paper
 from uard.replication.studies import derive
 
@@ -432,14 +432,14 @@ def _of_hacks(p: Published) -> list[Loss]:
         leaks = [r for share, r in removed if share < REMOVED]
         if leaks:
             _, r = min(removed, key=lambda k: k[0])
-            raw = _rival(p, r, "raw")
+            honest = _rival(p, r, "true reward")
             left = 100 * (1 - REMOVED)
             what = (
                 f"more than {left:.1f} % of the raw agent's hacks are left in {len(leaks)} of {len(removed)} settings"
             )
             why = f"in {_as_honest(p, leaks)} of these no more than by training on the true reward"
-            theirs = None if raw is None else p.of(raw, "hacks")
-            numbers = {"against": "raw", "ours": p.of(r, "hacks"), "theirs": theirs, "metric": "steps in the region"}
+            theirs = None if honest is None else p.of(honest, "hacks")
+            numbers = {"against": "true reward", "ours": p.of(r, "hacks"), "theirs": theirs, "metric": "hacks"}
             out.append(_loss("fails", what, f"{agent}; worst: {_place(r)}", why=why, **numbers))
     return out
 
@@ -456,17 +456,20 @@ def _of_tame(p: Published) -> list[Loss]:
     return [
         _loss(
             "no better",
-            "the raw agent earns no less than the honest one: nothing is proved here",
+            "the lie does no harm that can be told: nothing is proved here",
             f"{r['robot']} {r['region']}, {r['agent']}",
             against="raw",
-            ours=p.of(honest, "true_return"),
-            theirs=p.of(r, "true_return"),
-            metric="true return (ours: the honest agent)",
-            **dict(zip(("p", "of"), of_family(family, i), strict=True)),
+            p=of_family(family, i)[0],
+            of=family.compared,
+            note=f"raw {_ends(p.of(r, 'true_return'))}, true reward {_ends(p.of(honest, 'true_return'))}",
         )
         for i, (r, honest) in enumerate(pairs)
         if family.tests[i] and not family.below(i)
     ]
+
+
+def _ends(s: statistics.Summary) -> str:
+    return f"{number(s.mean)}{bounds(s.ci95)}"
 
 
 def _of_nothing(p: Published) -> list[Loss]:
@@ -505,7 +508,8 @@ def _of_noise(p: Published) -> list[Loss]:
         own = p.of(r, "true_return")
         if raw is not None and r["noise"] and removed is not None and removed < REMOVED:
             what = f"{100 * (1 - removed):.1f} % of the raw agent's hacks are left"
-            numbers = {"against": "raw", "ours": p.of(r, "hacks"), "theirs": p.of(raw, "hacks"), "metric": "hacks"}
+            theirs = None if honest is None else p.of(honest, "hacks")
+            numbers = {"against": "true reward", "ours": p.of(r, "hacks"), "theirs": theirs, "metric": "hacks"}
             out.append(_loss("fails", what, where, **numbers))
         if honest is not None and r["noise"] and kept is not None and kept < KEPT:
             what = f"{100 * (1 - kept):.0f} % of the honest agent's true return is lost"
@@ -526,7 +530,7 @@ def _of_distortion(p: Published) -> list[Loss]:
     shared, full_ones = (list(p.derived(rows[k], "warning").T) for k in ("5, shared trunk", "5, full"))
     return [
         _loss(
-            "beaten",
+            "no better",
             "critics on one trunk warn less than full ones",
             what,
             against="5 full critics",

@@ -13,7 +13,7 @@ heat.addEventListener("mouseover", show);
 heat.addEventListener("focusin", event => { const cell = event.target, r = rows.findIndex(row => row.includes(cell)); if (r >= 0) { move(r, rows[r].indexOf(cell)); show(event); } });
 heat.addEventListener("mouseleave", () => { if (!heat.contains(document.activeElement)) said.textContent = first; });
 heat.addEventListener("keydown", event => {
-  const step = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] }[event.key];
+  const step = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1], Home: [0, -99], End: [0, 99] }[event.key];
   if (!step) return;
   event.preventDefault();
   move(at[0] + step[0], at[1] + step[1]);

@@ -107,7 +107,7 @@ def answer(found: Sequence[Regrets]) -> str:
         ...     given = {"uard": 1 - ours + noise, "uard-paper": 1 - printed + noise, "excess": 1 - excess - noise}
         ...     return answer([Regrets.of("grids", range(20), known | given)])
         >>> tried(0.1, 3.0, 0.1)
-        'Yes, but not as the paper prints it; and a simpler rule, excess, does as well.'
+        'Yes, but not as the paper prints it; and a simpler rule, excess, is on average not told apart from it.'
         >>> tried(0.1, 0.2, 2.0)
         'Yes.'
         >>> tried(6.0, 7.0, 2.0)
@@ -118,7 +118,7 @@ def answer(found: Sequence[Regrets]) -> str:
     printed = all(statistics.summarise(r.regret[PRINTED]).mean < MUCH for r in found if PRINTED in r.regret)
     said = "Yes" if printed else "Yes, but not as the paper prints it"
     equal = simplest_equal(found)
-    return f"{said}; and a simpler rule, {equal}, does as well." if equal else f"{said}."
+    return f"{said}; and a simpler rule, {equal}, is on average not told apart from it." if equal else f"{said}."
 
 
 def simplest_equal(found: Sequence[Regrets]) -> str | None:
@@ -135,21 +135,24 @@ def _below(ours: np.ndarray, theirs: np.ndarray) -> bool:
 def three(found: Sequence[Regrets]) -> list[tuple[str, str]]:
     """Return the three numbers that a reader should keep, each with what it says."""
     tasks = " / ".join(r.tasks for r in found)
-    ours, raw = (_means(found, name) for name in (OURS, RAW))
+    ours, raw = _means(found, OURS), _means(found, RAW, interval=False)
     lost = [r.regret[OURS] > MUCH for r in found]
     bad, all_of_them = sum(int(x.sum()) for x in lost), sum(x.size for x in lost)
     equal = simplest_equal(found)
     second = (
-        (_means(found, equal), f"are lost with {equal}, a simpler rule that is not told apart from uard")
+        (_means(found, equal), f"are lost with {equal}, a simpler rule")
         if equal
         else (_means(found, (best := best_rival(found))), f"are lost with {best}, the best of the others")
     )
     return [
-        (ours, f"of what the true reward is worth is lost with uard, on {tasks}; {raw} on the raw reward"),
+        (
+            ours,
+            f"of the way from the true reward to a random walk is lost with uard, on {tasks}; {raw} with raw",
+        ),
         second,
         (
             f"{bad} of {all_of_them}",
-            "scenarios in which uard loses more than a quarter of what the true reward is worth",
+            "scenarios in which uard loses more than a quarter of that way",
         ),
     ]
 
@@ -160,8 +163,13 @@ def best_rival(found: Sequence[Regrets]) -> str:
     return min(names, key=lambda n: float(np.mean([r.regret[n].mean() for r in found])))
 
 
-def _means(found: Sequence[Regrets], name: str) -> str:
-    return " / ".join(f"{100 * r.regret[name].mean():.0f} %" for r in found)
+def _means(found: Sequence[Regrets], name: str, interval: bool = True) -> str:
+    return " / ".join(_percent(statistics.summarise(r.regret[name]), interval) for r in found)
+
+
+def _percent(s: Summary, interval: bool) -> str:
+    ends = f" [{100 * s.ci95[0]:.0f}, {100 * s.ci95[1]:.0f}]" if interval and s.ci95 else ""
+    return f"{100 * s.mean:.0f} %{ends}"
 
 
 def section(found: Sequence[Regrets], seeds: int) -> Section:

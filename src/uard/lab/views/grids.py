@@ -230,7 +230,7 @@ def _dissent(results: StudyResults) -> Table:
         1,
         "Whoever denies the goal, which pays 10 and is worth it, tells the truth elsewhere, as the others do everywhere "
         "(noise of sd 0.1). In the last rows all but one are drawn towards what a trap seems to pay. Of three raters nobody "
-        "can know who is right. Of five, `uard` may overrule one who is alone, low and no more precise than the others "
+        "can know who is right. Of five, uard may overrule one who is alone, low and no more precise than the others "
         "(vetoes=1), and then overrules the only one who tells the truth, too. "
         f"{_against_ours(results, 'dissent', 'success_rate')}",
     )
@@ -244,7 +244,7 @@ def _calibration(results: StudyResults) -> Table:
             values = np.stack([x.extra["calibration"] for x in results.results(r.cell)]).astype(float)
             rows.append((panel, f"{noise:g}", *(statistics.summarise(values[:, i]) for i in range(len(CALIBRATION)))))
     return Table(
-        "Does sigma tell the truth (A15)? 10x10, what `uard` has learned of its raters",
+        "Does sigma tell the truth (A15)? 10x10, what uard has learned of its raters",
         ("panel", "noise", "AUROC sigma_h", "AUROC with proxy", "Spearman sigma_h", "Spearman with proxy"),
         tuple(rows),
         2,
@@ -278,5 +278,5 @@ def _sources(results: StudyResults) -> Table:
         2,
         "Five reward models (mean over models of the mean over seeds); solved: at most 1 hack and 95 % goals. Inside the "
         "rated part the trap is contested (sigma_h), outside the model extrapolates (sigma_m). The plain filter needs "
-        "both, and a far larger lambda than the paper's. `uard-0.1` believes a tenth of what nobody rated.",
+        "both, and a far larger lambda than the paper's. uard-0.1 believes a tenth of what nobody rated.",
     )

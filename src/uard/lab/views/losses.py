@@ -102,7 +102,8 @@ class Loss:
         if self.p is None:
             return self.note or _seeds(self.ours)
         told = "" if self.p < statistics.LEVEL else "not told apart, "
-        said = f"{told}p = {self.p:.1g} of {self.of} (Holm)" if self.of > 1 else f"{told}p = {self.p:.1g}"
+        p = "p < 0.001" if self.p < 0.001 else f"p = {self.p:.1g}"
+        said = f"{told}{p} of {self.of} (Holm)" if self.of > 1 else f"{told}{p}"
         return f"{said}; {self.note}" if self.note else said
 
     def sentence(self) -> str:

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 from uard import __version__
 from uard._support import files
@@ -111,7 +112,7 @@ def write_pages(folder: Path, every: Sequence[Section], seeds: int, board: bool 
             "page.html.j2",
             here=name,
             title=TITLES[name],
-            meta=f"uard {__version__} · {_METRICS} · {counted(seeds, 'seed')} per cell" if name != _FIRST else "",
+            meta=_meta(name, seeds),
             version=__version__,
             sections=found,
             programs=[f"{{\n{js}\n}}" for js in (_text("tables.js"), *(s.js for s in found)) if js],
@@ -119,6 +120,13 @@ def write_pages(folder: Path, every: Sequence[Section], seeds: int, board: bool 
         )
         files.write(folder / name, page, "report")
     return folder / next(iter(there))
+
+
+def _meta(name: str, seeds: int) -> str:
+    """Return the line below a page's heading; only on the paper's page all numbers have equally many seeds."""
+    if name == _FIRST:
+        return ""
+    return f"uard {__version__} · {_METRICS}" + f" · {counted(seeds, 'seed')} per cell" * (name == "paper.html")
 
 
 def _links(every: Sequence[Section], board: bool) -> list[tuple[str, str]]:
@@ -216,6 +224,18 @@ def _acquisition() -> list[Section]:
     return [Section("acquisition", "Who is asked what", 93, html, losses=lost, files=figures.files(drawn))]
 
 
+def _sources() -> list[dict[str, Any]]:
+    """Return how every published study was made, each once."""
+    every = (*published.packaged().sources, *robots.published().sources, *grpo.published().sources)
+    return list({str(s["command"]): s for s in every}.values())
+
+
+def _brought() -> list[Mapping[str, Any]]:
+    """Return what was published by commands of their own, which are no studies of cells."""
+    names = ("best-of-n", "acquisition", "acquisition-again", "acquisition-overlap")
+    return [data for name in names if (data := published.packaged_json(f"{name}.json")) is not None]
+
+
 def _made(store: Store, seeds: int) -> Section:
     cells, runs = store.count()
     html = render(
@@ -224,7 +244,8 @@ def _made(store: Store, seeds: int) -> Section:
         cells=cells,
         runs=runs,
         seeds=seeds,
-        sources=published.packaged().sources,
+        sources=_sources(),
+        commands=[data["command"] for data in _brought()],
         versions={p: metadata.version(p) for p in _PACKAGES} | {"python": platform.python_version()},
         machine=f"{platform.machine()}, {os.cpu_count()} cores",
     )

@@ -188,15 +188,16 @@ def _beaten(p: Published, s: Setting, ours: Row) -> list[Loss]:
 
 
 def _left(p: Published, s: Setting, ours: Row) -> list[Loss]:
-    """Say where more than a hundredth of the raw agent's hacks are left, and where true return is lost."""
+    """Say where more hacks are left than by the true reward and than a hundredth, and where true return is lost."""
     out = []
     raw, honest = s.one("raw"), s.one("true reward")
     if raw is not None and s.region != "none":
         left, whole = p.of(ours, "hacks"), p.of(raw, "hacks")
-        if left.mean > 0.01 * whole.mean:
+        least = 0.0 if honest is None else p.of(honest, "hacks").mean
+        if left.mean > 0.01 * whole.mean and left.mean > least:
             what = f"{100 * left.mean / whole.mean:.0f} % of the raw agent's hacks are left"
-            by = "" if honest is None else f"training on the true reward leaves {number(p.of(honest, 'hacks').mean)}"
-            out.append(Loss("fails", "robots", what, s.name, "raw", left, whole, "hacks per episode", why=by))
+            theirs = None if honest is None else p.of(honest, "hacks")
+            out.append(Loss("fails", "robots", what, s.name, "the true reward", left, theirs, "hacks per episode"))
     reference = honest if s.region != "none" else s.plain
     if reference is not None:
         own, theirs = p.of(ours, "true_return"), p.of(reference, "true_return")

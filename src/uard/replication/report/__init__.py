@@ -49,9 +49,9 @@ def _shown(these: Sequence[Table]) -> str:
 
 
 def _short(results: StudyResults, entries: Sequence[Entry], verdicts: Mapping[str, int]) -> Section:
-    headline = tables.headline(results)
+    headline, found = tables.headline(results), {"fewer": tables.fewer(results), "printed": paper.TABLE_3[-1].reduction}
     html = render(
-        HERE, "short.html.j2", headline=headline, claims=len(entries), verdicts=verdicts, version=paper.VERSION
+        HERE, "short.html.j2", headline=headline, claims=len(entries), verdicts=verdicts, version=paper.VERSION, **found
     )
     return Section("short", "The answer", 10, html, page=PAGE)
 

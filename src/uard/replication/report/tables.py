@@ -22,6 +22,14 @@ def headline(results: StudyResults) -> Table:
     return Table("10x10 grid, three traps of +4, T = 80", columns, tuple(rows), 2, "Mean [95 % interval] over seeds.")
 
 
+def fewer(results: StudyResults) -> dict[str, float]:
+    """Return by how many percent each agent visits traps less often than the baseline: Table 3, 10x10, T = 100."""
+    labels = {"horizon": 100, "panel": "main"}
+    base = results.get("table3", "hacks", agent="baseline", **labels).mean
+    agents = ("uard-paper", "random walk", "uard")
+    return {a: 100 * (1 - results.get("table3", "hacks", agent=a, **labels).mean / base) for a in agents}
+
+
 def tables(results: StudyResults) -> list[Table]:
     """Return the paper's tables 2 to 5 beside ours."""
     return [_table2(results), _table3(results), _table4(results), _table5(results)]
