@@ -456,7 +456,7 @@ def test_sections_of_packages_join_the_report(broken, tmp_path):
         ({"css": "</style>"}, "css = '</style>': must be without </style>"),
         ({"files": {"../up": ""}}, "files = '../up': must be a plain name"),
         ({"files": {"index.html": ""}}, "files = 'index.html': must be a plain name, none of index.html"),
-        ({"page": "other.html"}, "page = 'other.html': must be one of index.html, paper.html, numbers.html"),
+        ({"page": "other.html"}, "page = 'other.html': must be one of index.html, numbers.html, paper.html"),
         ({"losses": ("It hacks.",)}, "losses = 'It hacks.': must be of uard.lab.views.losses.Loss"),
     ],
 )

@@ -153,6 +153,9 @@ def train_one(run: Run, program: Program) -> TrainedTables:
     starts = jnp.atleast_1d(jnp.asarray(task.start, jnp.int32))
     raters = run.law.centre.shape[-1]
     asks_raters = mitigation.reads_feedback
+    # Where a segment begins and ends in its chunk: those of the first chunk, and the whole of any later one.
+    doubled = DOUBLED if mitigation.refits_early and asks_raters else DOUBLED[[0, -1]]
+    lows, highs = np.append(doubled[:-1], 0), np.append(doubled[1:], CHUNK)
     # One row per state-action, so that a step reads each table once.
     ones = jnp.ones_like(task.reward)
     columns = [run.truth.hack, run.truth.reward, task.reward, run.truth.goal, ones, 0.0 * ones]
@@ -226,7 +229,7 @@ def train_one(run: Run, program: Program) -> TrainedTables:
         sums = c.sums + step_adds
         return sums, lax.dynamic_update_slice(c.log, sums[None], (jnp.minimum(c.episode, program.episodes), 0))
 
-    def one_step(c: _Carry, draws: _Draws) -> tuple[_Carry, None]:
+    def one_step(c: _Carry, draws: _Draws) -> _Carry:
         # A chunk goes on after the last episode, but to no effect: nothing is rated, learned or counted then.
         active = (c.episode < program.episodes).astype(jnp.float32)
         action, abstained = select_action(c, draws.agent.explore, draws.agent.action)
@@ -256,23 +259,24 @@ def train_one(run: Run, program: Program) -> TrainedTables:
             sums=jnp.where(done, 0.0, sums),
             log=log,
             steps=c.steps + active.astype(jnp.int32),
-        ), None
+        )
 
-    def fit_and_go(c: _Carry, draws: _Draws, steps: tuple[Array, Array]) -> _Carry:
-        c = c._replace(statistics=panel_statistics(c.rows))
-        return lax.fori_loop(*steps, lambda i, c: one_step(c, jax.tree.map(lambda x: at(x, i), draws))[0], c)
+    def segment(loop: tuple[_Carry, Array, Array, Array]) -> tuple[_Carry, Array, Array, Array]:
+        """Measure the panel's statistics and go on to the segment's end.
 
-    def chunk(loop: tuple[_Carry, Array, Array, Array], refits: bool = False) -> tuple[_Carry, Array, Array, Array]:
+        One loop for the first chunk and for all others: half of what a second one would take to compile. Each segment
+        draws the random numbers of its whole chunk, which are the same every time.
+        """
         c, number, q_kept, rows_kept = loop
-        draws = _drawn(run, number, actions, raters if asks_raters else None)
-        slot = c.episode * program.snapshots // program.episodes
-        if refits:
-            bounds = jnp.asarray(DOUBLED[:-1]), jnp.asarray(DOUBLED[1:])
-            c, _ = lax.scan(lambda c, steps: (fit_and_go(c, draws, steps), None), c, bounds)
-        else:
-            if asks_raters:
-                c = c._replace(statistics=panel_statistics(c.rows))
-            c, _ = lax.scan(one_step, c, draws)
+        kind = jnp.minimum(number, len(lows) - 1)
+        chunk = jnp.maximum(number - len(lows) + 2, 0)
+        draws = _drawn(run, chunk.astype(jnp.uint32) + 1, actions, raters if asks_raters else None)
+        # All segments of the first chunk fill what it fills: it began before any episode was over.
+        slot = jnp.where(chunk > 0, c.episode * program.snapshots // program.episodes, 0)
+        if asks_raters:
+            c = c._replace(statistics=panel_statistics(c.rows))
+        low, high = at(jnp.asarray(lows), kind), at(jnp.asarray(highs), kind)
+        c = lax.fori_loop(low, high, lambda i, c: one_step(c, jax.tree.map(lambda x: at(x, i), draws)), c)
         if program.snapshots:
             # A chunk can pass over several slots, so all that are left are filled; the next chunk overwrites them.
             later = (jnp.arange(program.snapshots) >= slot)[:, None, None, None]
@@ -297,10 +301,8 @@ def train_one(run: Run, program: Program) -> TrainedTables:
         steps=jnp.int32(0),
     )
     kept = jnp.zeros((program.snapshots, *q.shape)), jnp.zeros((program.snapshots, *rows.shape))
-    loop = start, jnp.uint32(1), *kept
-    if mitigation.refits_early and asks_raters:
-        loop = chunk(loop, refits=True)
-    c, _, q_kept, rows_kept = lax.while_loop(lambda loop: loop[0].episode < program.episodes, chunk, loop)
+    loop = start, jnp.int32(0), *kept
+    c, _, q_kept, rows_kept = lax.while_loop(lambda loop: loop[0].episode < program.episodes, segment, loop)
     log = c.log[:-1]  # what came after the last episode was put into the last row
     return TrainedTables(log, c.steps, c.q, from_rows(c.rows), q_kept, from_rows(rows_kept))
 
