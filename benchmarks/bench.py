@@ -90,7 +90,7 @@ def deep(found: dict[str, Any]) -> Iterator[Line]:
         part, first = row["part"], row["us_per_step"] / row["times_first"]
         if row["name"] != "uard":
             continue
-        asked = 1.5 if part.startswith("game") else 1.15
+        asked = 1.5 if part.endswith(("BoatRace", "TomatoWatering")) else 1.15
         low, high = (x / first for x in row["range_us"])
         floor = row["floor_times_first"]
         yield Line(f"{part}: raw to uard", row["times_first"], low, high, "times", asked, True, floor, "arithmetic")

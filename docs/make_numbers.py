@@ -9,12 +9,14 @@ are trained (a minute), and only with ``--train``.
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -285,6 +287,42 @@ def _way(family: Family, i: int) -> str:
 # What docs/migrating.md says.
 
 
+@cache
+def bench() -> Mapping[str, Any]:
+    """Return what `make bench` wrote."""
+    return json.loads((ROOT / "benchmarks" / "results" / "bench.json").read_text(encoding="utf-8"))
+
+
+def speed() -> str:
+    """Return the table of `make bench`, and where it was made."""
+    found = bench()
+    rows = [
+        (
+            x["what"],
+            f"{x['value']:.3g} [{x['low']:.3g}, {x['high']:.3g}] {x['unit']}",
+            "" if x["asked"] is None else f"{'at most' if x['most'] else 'at least'} {x['asked']:g}",
+            {None: "", True: "yes", False: "**no**"}[x["met"]],
+            "" if x["roof"] is None else f"{x['roof']:.3g} ({x['roof_is']})",
+        )
+        for x in found["lines"]
+    ]
+    versions = ", ".join(f"{name} {number}" for name, number in found["packages"].items() if number != "not installed")
+    busy = f"load {found['load_at_the_end']:.0f} at its end"
+    made = f"`{found['command']}`: {found['machine']}, {busy}; {versions}. A load above the cores means that others worked."
+    return table(("what", "median [range]", "asked", "met", "roof"), rows, ("what", "met", "roof")) + f"\n\n{made}"
+
+
+def adapters_cost() -> str:
+    """Return what the adapters cost, side by side and in their own code."""
+    lines = {x["what"].removeprefix("adapter: "): x for x in bench()["lines"] if x["what"].startswith("adapter: ")}
+    rows = [
+        (name, *(f"{y['value']:.1f} % [{y['low']:.1f}, {y['high']:.1f}]" for y in (x, lines[f"{name}, our code"])))
+        for name, x in lines.items()
+        if not name.endswith(", our code")
+    ]
+    return table(("training", "side by side", "in our own code"), rows, ("training",))
+
+
 def _renamed(names: Mapping[str, str]) -> str:
     """Return old and new names, but for those that nobody outside could have used."""
     known = {old: new for old, new in names.items() if not re.search(r"(^|\.)_", old)}
@@ -367,6 +405,8 @@ PUBLISHED: dict[str, Callable[[], str]] = {
     "choose-share": choose_share,
     "choose-judges": choose_judges,
     "choose-robots": choose_robots,
+    "speed": speed,
+    "adapters-cost": adapters_cost,
     "moved": moved_modules,
     "moved-names": moved_names,
 }
