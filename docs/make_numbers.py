@@ -308,7 +308,7 @@ def speed() -> str:
     ]
     versions = ", ".join(f"{name} {number}" for name, number in found["packages"].items() if number != "not installed")
     busy = f"load {found['load_at_the_end']:.0f} at its end"
-    made = f"`{found['command']}`: {found['machine']}, {busy}; {versions}. A load above the cores means that others worked."
+    made = f"`{found['command']}`: {found['machine']}, {busy} (above the cores: others worked); {versions}."
     return table(("what", "median [range]", "asked", "met", "roof"), rows, ("what", "met", "roof")) + f"\n\n{made}"
 
 
