@@ -70,7 +70,7 @@ class PassingEnv(VecEnvWrapper):
 
 
 class PassingReplayBuffer(ReplayBuffer):
-    def add(self, *arguments: Any) -> None:
+    def add(self, *arguments: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         super().add(*arguments)
 
     def _get_samples(self, batch_inds: Any, env: Any = None) -> Any:
@@ -78,7 +78,7 @@ class PassingReplayBuffer(ReplayBuffer):
 
 
 class PassingRolloutBuffer(RolloutBuffer):
-    def add(self, *arguments: Any) -> None:
+    def add(self, *arguments: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         super().add(*arguments)
 
     def compute_returns_and_advantage(self, last_values: Any, dones: Any) -> None:

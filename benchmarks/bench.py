@@ -100,10 +100,11 @@ def adapters(found: dict[str, Any]) -> Iterator[Line]:
     """Read adapters.py."""
     for row in found["rows"]:
         limit = None if row["limit"] is None else 100 * row["limit"]
-        numbers = (100 * x for x in (row["cost"], *row["range"]))
-        yield Line(f"adapter: {row['name']}", *numbers, "percent", limit, True, 100 * row["floor"], "passes through")
-        numbers = (100 * x for x in (row["clocked"], *row["clocked_range"]))
-        yield Line(f"adapter: {row['name']}, our code", *numbers, "percent", limit)
+        value, low, high = (100 * x for x in (row["cost"], *row["range"]))
+        roof = 100 * row["floor"]
+        yield Line(f"adapter: {row['name']}", value, low, high, "percent", limit, True, roof, "passes through")
+        value, low, high = (100 * x for x in (row["clocked"], *row["clocked_range"]))
+        yield Line(f"adapter: {row['name']}, our code", value, low, high, "percent", limit)
 
 
 def physics(found: dict[str, Any]) -> Iterator[Line]:
@@ -115,9 +116,9 @@ def physics(found: dict[str, Any]) -> Iterator[Line]:
         row, bare = rows[name], rows["MuJoCo's steps alone, 1 thread"]["rate"]
         asked = 2.0 if what.startswith("hopper") and "8 copies" in what else None
         threads = int(name.split()[1])
-        numbers = (x / theirs for x in (row["rate"], *row["range"]))
+        value, low, high = (x / theirs for x in (row["rate"], *row["range"]))
         label = f"{what.split(':')[0]}, {what.split(', ')[1]}: over SyncVectorEnv"
-        yield Line(label, *numbers, "times", asked, False, threads * bare / theirs, "bare steps on each core")
+        yield Line(label, value, low, high, "times", asked, False, threads * bare / theirs, "bare steps on each core")
 
 
 def cells(found: dict[str, Any]) -> Iterator[Line]:
@@ -132,7 +133,8 @@ def cells(found: dict[str, Any]) -> Iterator[Line]:
 def start(found: dict[str, Any]) -> Iterator[Line]:
     """Read start.py."""
     for row in found["rows"]:
-        yield Line(f"first result of uard run, {row['name']}", row["seconds"], *row["range"], "s", row["asked"])
+        low, high = row["range"]
+        yield Line(f"first result of uard run, {row['name']}", row["seconds"], low, high, "s", row["asked"])
 
 
 Reader = Callable[[dict[str, Any]], Iterator[Line]]

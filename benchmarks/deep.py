@@ -117,7 +117,8 @@ def trained(world: Any, agent: Any, mitigation: str, fits: int = 16) -> Callable
     from uard.training.compiled import runs
     from uard.training.feedback.rating_model import RatingModel
 
-    (loop,) = {t.loop() for t in TRAINERS if hasattr(t, "loop") and agent.family in t.families}
+    trainers: tuple[Any, ...] = tuple(TRAINERS)
+    (loop,) = {t.loop() for t in trainers if hasattr(t, "loop") and agent.family in t.families}
     model = None if mitigation == "raw" else RatingModel(fits=fits)
     one = deep.make_run(world, agent, named(mitigation), 0, rating_model=model)
 

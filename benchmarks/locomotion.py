@@ -20,7 +20,7 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable
-from importlib import metadata, util
+from importlib import import_module, metadata, util
 from pathlib import Path
 from typing import Any
 
@@ -87,8 +87,7 @@ def ours(robot: str, copies: int, steps: int, threads: int) -> Rate:
 
 def alone(robot: str, copies: int, steps: int) -> Rate:
     """MuJoCo's own steps and nothing else, on one thread: the roof of one core."""
-    import mujoco
-
+    mujoco: Any = import_module("mujoco")
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, copies, Locomotion(robot).actions))
     simulator = Locomotion(robot).simulator(copies, 0)
 
@@ -108,9 +107,8 @@ def alone(robot: str, copies: int, steps: int) -> Rate:
 
 def rolled(robot: str, copies: int, steps: int, threads: int) -> Rate:
     """MuJoCo's own threads (``mujoco.rollout``), a step of all copies at a time, as an agent needs them."""
-    import mujoco
-    from mujoco import rollout
-
+    mujoco: Any = import_module("mujoco")
+    rollout: Any = import_module("mujoco.rollout")
     spec = Locomotion(robot)
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, copies, spec.actions))
     simulator = spec.simulator(copies, 0)
