@@ -238,8 +238,8 @@ def test_losses_are_short_lines_that_name_what_they_cost():
     assert lines
     for line in lines:
         assert line.study == "robots, uard-0.1", "none of it is of today's rule"
-        assert line.ours is not None
-        assert line.theirs is not None
+        both = line.ours is not None and line.theirs is not None
+        assert both or line.note.startswith("raw "), "where nothing is lost there is no gap, but both numbers are said"
         assert line.sure
 
 
