@@ -41,7 +41,7 @@ WORDS = {  # what a panel is called after the worst that sits in it
     "some repeating the proxy": "some repeat the reward",
     "one rater": "one rater",
 }
-TASKS = {"random grids": "grids", "random MDPs": "decision problems"}
+TASKS = {"random grids": "grids", "random MDPs": "MDPs"}
 HEADLINE = {  # of the README: from what needs no thought to ours
     "raw": "the reward as it is (`raw`)",
     "mean-of-annotations": "the mean of the ratings (`mean-of-annotations`)",
@@ -230,7 +230,7 @@ def choose_grids() -> str:
 
 
 def choose_decisions() -> str:
-    """Return what is enough on random decision problems, by kind of panel."""
+    """Return what is enough on random MDPs, by kind of panel."""
     return _kinds(regrets()[1])
 
 

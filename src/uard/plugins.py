@@ -127,10 +127,10 @@ class Plugin:
 
 @cache
 def found(kind: str) -> tuple[Plugin, ...]:
-    """Return all entry points of a kind, sorted by name and package; looked up once per process."""
+    """Return all entry points of a kind, uard's own first, then by name and package; looked up once per process."""
     entries = metadata.entry_points(group=KINDS[kind])
     every = {Plugin(kind, e.name, f"{e.dist.name} {e.dist.version}" if e.dist else "unknown", e) for e in entries}
-    return tuple(sorted(every, key=lambda p: (p.name, p.package, p.entry.value)))
+    return tuple(sorted(every, key=lambda p: (not p.package.startswith("uard "), p.name, p.package, p.entry.value)))
 
 
 def brought(

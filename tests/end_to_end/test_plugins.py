@@ -104,6 +104,15 @@ def sections(results):
 def made_already(results):
     from uard.lab.views.sections import Section
     return [Section("made", "Made", 1, "<p>twice</p>")]
+
+def several(results):
+    from uard.lab.views.sections import Section
+    inside = Section("inside", "Inside", 4, '<p id="losses-table">x</p>')
+    capital = Section("capital", "Capital", 5, "", files={"Shared.json": ""})
+    open_ = Section("open", "Open", 6, "<p>x<!-- y")
+    away = Section("away", "Away", 7, "<meta http-equiv=refresh content=0>")
+    good = Section("good", "Good", 8, "<p id=good-part>x</p>", files={"shared.json": ""})
+    return [inside, open_, away, good, capital]
 """
 OLD = """
 from uard.method.mitigations import Mitigation
@@ -146,6 +155,7 @@ odd = uard_broken:three
 gone = uard_broken:Nothing
 late = uard_broken:sections
 made = uard_broken:made_already
+several = uard_broken:several
 """
 
 
@@ -444,7 +454,19 @@ def test_sections_of_packages_join_the_report(broken, tmp_path):
     why = {error.plugin.name: str(error) for error in bad}
     assert "AttributeError" in why["gone"]
     assert "study = 'no such study': must be one of" in why["late"]
-    assert "the name 'made' of its section or file is taken" in why["made"]
+    assert "its section 'made' is left out, for the name 'made' in it is taken" in why["made"]
+    assert [s.id for s in good if s.id not in ("example",)] == ["good"], "one fault costs one section"
+    several = [str(error).partition("its section ")[2] for error in bad if error.plugin.name == "several"]
+    assert several == [
+        "'inside' is left out, for the name 'losses-table' in it is taken",
+        "'open' is left out, for <!-- begins what no part of a page needs: comments, declarations",
+        "'away' is left out, for <meta> in line 1 is not for a part of a page",
+        "'capital' is left out, for the name 'shared.json' in it is taken",
+    ]
+
+
+def test_names_are_first_of_all_uards_own(broken):
+    assert plugins.found("report")[0].name == "replication"
 
 
 @pytest.mark.parametrize(
@@ -452,8 +474,16 @@ def test_sections_of_packages_join_the_report(broken, tmp_path):
     [
         ({"id": "Two words"}, "id = 'Two words': must be small letters"),
         ({"order": float("nan")}, "order = nan: must be a finite number"),
-        ({"js": "'</SCRIPT>'"}, "js = \"'</SCRIPT>'\": must be without </script>"),
-        ({"css": "</style>"}, "css = '</style>': must be without </style>"),
+        ({"js": "'</SCRIPT>'"}, "js = \"'</SCRIPT>'\": must be without </script"),
+        ({"js": "'<!--<script>'"}, "must be without <!--"),
+        ({"css": "</style>"}, "css = '</style>': must be without </style"),
+        ({"css": "a\0"}, "css = 'a\\x00': must be text without NUL"),
+        ({"html": None}, "html = None: must be text"),
+        ({"title": "x" * 500}, "must be at most 120 characters"),
+        ({"files": None}, "files = None: must be a mapping of names to texts"),
+        ({"files": {"x.txt": b"x"}}, "files['x.txt'] = b'x': must be text"),
+        ({"files": {"x" * 300: ""}}, "must be a plain name"),
+        ({"losses": iter(())}, "must be a tuple of uard.lab.views.losses.Loss"),
         ({"files": {"../up": ""}}, "files = '../up': must be a plain name"),
         ({"files": {"index.html": ""}}, "files = 'index.html': must be a plain name, none of index.html"),
         ({"page": "other.html"}, "page = 'other.html': must be one of index.html, numbers.html, paper.html"),

@@ -239,6 +239,28 @@ def test_every_link_leads_somewhere_and_every_image_is_there(made, opened, name)
     assert [i for i in images if not (i[0] and i[1] and i[2] > 0)] == []
 
 
+def test_a_report_of_panels_alone_links_what_is_there_and_keeps_its_losses(browser, tmp_path):
+    files = Path(published.__file__).parents[1] / "published" / "panels.json"
+    command = [UARD, "reproduce", "panels", "--published", files, "--report", tmp_path]
+    subprocess.run(command, check=True, capture_output=True)
+    page = browser.new_page()
+    page.goto((tmp_path / "index.html").as_uri())
+    links = set(page.eval_on_selector_all("a", "links => links.map(a => a.getAttribute('href'))"))
+    assert links >= {"#losses", "#choose", "numbers.html"}
+    for target in links:
+        file, _, place = target.partition("#")
+        assert not place or f'id="{place}"' in (tmp_path / (file or "index.html")).read_text(encoding="utf-8"), target
+    assert page.locator("#losses-table tbody tr").count() > 0
+    assert json.loads(files.read_text())["command"] in page.locator("#front").inner_text()
+    page.close()
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_no_id_is_given_twice(opened, name):
+    ids = opened(name).eval_on_selector_all("[id]", "all => all.map(e => e.id)")
+    assert sorted(ids) == sorted(set(ids))
+
+
 @pytest.mark.parametrize("name", PAGES[:3])
 def test_the_navigation_names_every_section_in_order(opened, name):
     page = opened(name)
@@ -391,13 +413,21 @@ HOSTILE = """
 
 def test_what_a_text_brings_onto_the_page_does_not_run_and_our_programs_do(browser, tmp_path):
     mine = sections.Section(
-        "mine", "<b>T</b>", 1, HOSTILE, css="h2 { color: rgb(1, 2, 3) }", js="window.ours = 'ä < 1'"
+        "mine", "<b>T</b>", 1, HOSTILE, css="h2 {\r\ncolor: rgb(1, 2, 3) }", js="window.ours =\r 'ä < 1'"
     )
     other = sections.Section("other", "Other", 2, "", js="window.more = window.ours + '!'")
     programs = [f"{{\n{s.js}\n}}" for s in (mine, other)]
-    values = {"version": "1", "here": "x.html", "title": "T", "meta": "", "pages": [], "programs": programs}
+    values = {
+        "version": "1",
+        "here": "x.html",
+        "title": "T",
+        "meta": "",
+        "pages": [],
+        "leads": [],
+        "programs": programs,
+    }
     text = templates.render(templates.HERE, "page.html.j2", sections=[mine, other], **values)
-    (tmp_path / "page.html").write_text(text, encoding="utf-8")
+    (tmp_path / "page.html").write_text(text, encoding="utf-8", newline="")
     page = browser.new_page()
     page.goto((tmp_path / "page.html").as_uri())
     for place in ("#link", "#button"):

@@ -262,6 +262,22 @@ def test_long_messages_are_broken_between_words_in_a_terminal():
     assert len(lines) > 2
 
 
+@pytest.mark.parametrize("columns", ["0", "5", "nonsense"])
+@pytest.mark.parametrize("command", ["--help", "list uard", "run NoSuchTask"])
+def test_a_terminal_without_room_is_printed_to_as_well(command, columns):
+    environment = os.environ | {"COLUMNS": columns}
+    done = subprocess.run([UARD, *command.split()], capture_output=True, text=True, env=environment, timeout=60)
+    assert done.returncode in (0, 2)
+    assert "uard" in done.stdout or "NoSuchTask" in done.stderr
+
+
+@pytest.mark.parametrize("arguments", ["--help >&-", "list >&-", "list nonsense 2>&-", "list >&- 2>&-"])
+def test_a_closed_output_is_no_error(arguments):
+    done = subprocess.run(f"{UARD} {arguments}", shell=True, capture_output=True, text=True, check=False)
+    assert done.returncode == (2 if "nonsense" in arguments else 0)
+    assert "Traceback" not in done.stderr
+
+
 def test_entries_whose_name_is_too_long_are_whole(capsys):
     terminal.entries("title", [(LONG * 2, "text", ""), ("b", "what b is " * 20, "(of a package 1.0)")])
     lines = capsys.readouterr().out.splitlines()

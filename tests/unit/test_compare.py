@@ -123,7 +123,18 @@ def test_what_only_one_has_and_what_is_damaged_is_named(compared, tmp_path):
         assert all(2 not in c.seeds for c in again.cells)
         assert len(again.damaged) == 2
         assert "left out, for they are damaged: 2 results" in lines(again)
+        assert lines(again)[-1] == "verdict: differ in what can be read"
         assert a.quarantined() == []
+
+
+def test_what_is_damaged_is_not_called_identical(compared, tmp_path):
+    compared({}, {})
+    with closing(Store(tmp_path / "0.sqlite")) as a, closing(Store(tmp_path / "1.sqlite")) as b:
+        with closing(sqlite3.connect(a.path)) as db, db:
+            db.execute("update results set metrics = replace(metrics, '1', '2') where seed = 2")
+        again = compare(a, b)
+    assert (again.identical, again.differs) == (False, False)
+    assert lines(again)[-1] == "verdict: identical in what can be read"
 
 
 def test_nothing_in_common_is_refused(compared):

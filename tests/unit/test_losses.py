@@ -47,6 +47,12 @@ def test_how_sure(fields, says):
         ({"kind": "worse"}, "kind = 'worse': must be one of beaten"),
         ({"what": " "}, "what = ' ': must be some words"),
         ({"why": "x" * 200}, "why = "),
+        ({"where": None}, "where = None: must be text"),
+        ({"ours": 1.0}, "ours = 1.0: must be a uard.lab.statistics.Summary, or None"),
+        ({"theirs": THEIRS._replace(mean=float("nan"))}, "theirs[0] = nan: must be finite"),
+        ({"p": "small"}, "p = 'small': must be a finite number in [0, 1]"),
+        ({"p": float("nan")}, "p = nan: must be"),
+        ({"of": 0}, "of = 0: must be a whole number >= 1"),
     ],
 )
 def test_silly_losses_are_refused(fields, says):

@@ -1,4 +1,4 @@
-"""Grids and decision problems drawn at random, and the oracle that regret is measured against."""
+"""Grids and MDPs drawn at random, and the oracle that regret is measured against."""
 
 import numpy as np
 import pytest

@@ -28,14 +28,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     SIGTERM.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    signals.open_output()
     if arguments in (["--version"], ["-V"]):
         print(f"uard {__version__}")
         return
     try:
         with signals.ending():
             _run(arguments)
-            if sys.stdout is not None:  # its reader may have closed it from the start
-                sys.stdout.flush()
+            sys.stdout.flush()
     except BaseException as error:
         if signals.received() is None and not isinstance(error, KeyboardInterrupt):
             _end(error)
@@ -76,6 +76,7 @@ def _run(arguments: list[str]) -> None:
     from uard.cli import terminal
 
     terminal.shows_what_it_can()
+    terminal.is_wide_enough()
     console = Console(stderr=True, highlight=False)
     command = _parsed(arguments, console)
     try:

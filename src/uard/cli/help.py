@@ -35,7 +35,7 @@ def explain(kind: Any) -> None:
         docs = _documented(part)
         for field in dataclasses.fields(part):
             if "help" not in field.metadata and field.name in docs:
-                text = " ".join(docs[field.name].split())
+                text = " ".join(docs[field.name].split()).replace(" Repeatable.", "")  # tyro says it, too
                 field.metadata = MappingProxyType({**field.metadata, "help": text})  # pyright: ignore[reportAttributeAccessIssue]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,10 +20,11 @@ from uard.cli.training import DEFAULT_STORE, UNWATCHED, WatchOptions
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    import numpy as np
     from rich.console import Console
 
     from uard.lab.execution.store import Store
-    from uard.lab.study import Study
+    from uard.lab.study import Row, Study
     from uard.lab.views.panels import PerSeed
 
 
@@ -82,13 +84,17 @@ class Reproduce:
         if self.extract is not None:
             from uard.lab.views import published
 
-            line = f"uard reproduce {' '.join(self.studies)} {self._said_of_seeds}"
-            terminal.write_json(published.extract(chosen, store, seeds, line), self.extract, "extract", indent=None)
+            data = published.extract(chosen, store, seeds, self._command)
+            terminal.write_json(data, self.extract, "extract", indent=None)
         if len(chosen) == 1 and chosen[0].brief:
             from uard.lab.views.study_results import StudyResults
 
             results = StudyResults(store, seeds, chosen)
-            self._show_panels(chosen[0], lambda r, metric: results.values(r.cell, metric), self.seeds, console)
+
+            def per_seed(row: Row, metric: str) -> np.ndarray:
+                return results.values(row.cell, metric)
+
+            self._show_panels(chosen[0], per_seed, self.seeds, self._command, console)
         elif self.report is not None:
             from uard.lab.views import page
 
@@ -114,9 +120,10 @@ class Reproduce:
         if missing := len(study.rows) - len(results.rows(study.name)):
             allowed = f"a file with all rows of {study.name}: {missing} of {len(study.rows)} are not in it"
             raise InvalidValueError("published", self.published, allowed)
-        self._show_panels(study, results.per_seed, results.seeds(study.name), console)
+        command = results.command(study.name)
+        self._show_panels(study, results.per_seed, results.seeds(study.name), command, console)
 
-    def _show_panels(self, study: Study, per_seed: PerSeed, seeds: int, console: Console) -> None:
+    def _show_panels(self, study: Study, per_seed: PerSeed, seeds: int, command: str, console: Console) -> None:
         """Print the regrets of a study of random panels, or write a page of them."""
         from uard.lab.views import page, panels
 
@@ -125,7 +132,7 @@ class Reproduce:
             for table in panels.tables(found):
                 terminal.show(table)
             return
-        written = page.write_pages(Path(self.report), page.of_panels(study, found, seeds), seeds)
+        written = page.write_pages(Path(self.report), page.of_panels(study, found, seeds, command), seeds)
         terminal.say(console, f"report: {written}")
 
     def _show_own(self, study: Study, store: Store) -> None:
@@ -140,6 +147,12 @@ class Reproduce:
     @property
     def _seeds(self) -> range:
         return range(self.first_seed, self.first_seed + self.seeds)
+
+    @property
+    def _command(self) -> str:
+        """What makes the same again."""
+        joining = [f"--mitigation {shlex.quote(name)}" for name in self.mitigation]
+        return " ".join(["uard reproduce", *self.studies, *joining, self._said_of_seeds])
 
     @property
     def _said_of_seeds(self) -> str:
@@ -161,6 +174,7 @@ class Reproduce:
     def _check_outputs(self, chosen: Sequence[Study]) -> None:
         """Refuse before training, not after it, what cannot be written."""
         from uard.lab import studies
+        from uard.lab.views import sections
 
         alone = len(chosen) == 1 and bool(chosen[0].brief)
         whole = {s.name for s in studies.grid()} <= {s.name for s in chosen}
@@ -172,6 +186,8 @@ class Reproduce:
             raise InvalidValueError("extract", self.extract, "left out with --published, which trains nothing")
         if self.report is not None:
             files.prepare_folder(self.report, "report")
+            for page in (*sections.PAGES, sections.BOARD):
+                files.prepare(Path(self.report, page), "report", self.store, self.published)
         terminal.check_json(self.extract, self.store, field="extract")
         for name, given in (("report", self.report), ("extract", self.extract)):
             if self.failed and given is not None:

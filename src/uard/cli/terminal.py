@@ -5,6 +5,8 @@ from __future__ import annotations
 import codecs
 import io
 import json
+import os
+import shutil
 import sys
 from collections.abc import Container, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -33,6 +35,17 @@ def output() -> Console:
 def width(console: Console | None = None) -> int:
     """Return how many columns a line may take: 80 where nobody says."""
     return min(_WIDE, max(_NARROW, (console or output()).width))
+
+
+def is_wide_enough() -> None:
+    """Let rich and tyro never see a terminal of no columns, in which the one prints nothing and the other never ends.
+
+    ``COLUMNS=0`` is what some containers set; then the terminal itself is asked, or it is 80.
+    """
+    if not os.environ.get("COLUMNS", "1").strip("0"):
+        del os.environ["COLUMNS"]
+    if shutil.get_terminal_size().columns < _NARROW:
+        os.environ["COLUMNS"] = str(_NARROW)
 
 
 def shows_what_it_can() -> None:

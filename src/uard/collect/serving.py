@@ -79,8 +79,8 @@ def serve(
                 say(f"{rater}: {url}/enter/{secret}")
             _tell_known(store, [rater for rater, _ in links], say)
             say(f"owner: {url}/owner" + ("" if owner_password else f"  (password {password})"))
-            say("Each link works once. Ctrl-C ends the server; every answer that was acknowledged is kept.")
-            _run(uvicorn, app, listener, behind=public is not None)
+            ends = "Each link works once. Ctrl-C ends the server; every answer that was acknowledged is kept."
+            _run(uvicorn, app, listener, behind=public is not None, ready=lambda: say(ends))
 
 
 def _asking(project: Project, store: AnswerStore) -> Callable[[str, int, Collection[str]], None]:
@@ -132,7 +132,7 @@ def _uvicorn() -> Any:
         ) from None
 
 
-def _run(uvicorn: Any, app: Any, listener: socket.socket, behind: bool) -> None:
+def _run(uvicorn: Any, app: Any, listener: socket.socket, behind: bool, ready: Callable[[], None]) -> None:
     config = uvicorn.Config(
         app,
         log_level="warning",
@@ -143,8 +143,16 @@ def _run(uvicorn: Any, app: Any, listener: socket.socket, behind: bool) -> None:
         proxy_headers=behind,  # from this machine: the address of whoever asks, for the limits
         timeout_graceful_shutdown=int(_ENDING),
     )
+    server = uvicorn.Server(config)
+    start = server.startup
+
+    async def startup(sockets: list[socket.socket] | None = None) -> None:
+        await start(sockets=sockets)
+        ready()  # from now on a signal ends it in order
+
+    server.startup = startup
     with suppress(KeyboardInterrupt):  # uvicorn ends cleanly first, then raises what it was ended by
-        uvicorn.Server(config).run(sockets=[listener])
+        server.run(sockets=[listener])
 
 
 def _checked(host: str, public_url: str | None) -> str | None:

@@ -1,4 +1,4 @@
-"""A small decision problem as tables, and its one-step dynamics.
+"""A small MDP (Markov decision process) as tables, and its one-step dynamics.
 
 ``Task`` is what an agent meets. ``HiddenTruth`` is for evaluation only and travels apart from it.
 """

@@ -1,4 +1,4 @@
-"""Tasks drawn at random: grids with traps anywhere, and decision problems without any geometry."""
+"""Tasks drawn at random: grids with traps anywhere, and MDPs (Markov decision processes) without any geometry."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def random_grid(seed: int) -> TrapGrid:
 
 @dataclass(frozen=True)
 class RandomMDP(TableEnvironment):
-    """A deterministic decision problem without geometry: every step leads to a state drawn at random.
+    """A deterministic MDP without geometry: every step leads to a state drawn at random.
 
     Rewards are normal (sd 0.3), one step in twenty pays 1 to 3 more. The observed reward lies at a tenth of the steps
     by 1 + |N(0, 3)|: in one problem of three it pays too much there, in one too much or too little, and in one three

@@ -1,4 +1,4 @@
-"""Raters whom nobody has tuned anything on: random panels on random grids and random decision problems.
+"""Raters whom nobody has tuned anything on: random panels on random grids and random MDPs.
 
 Scenario n is ``random_grid(n)`` or ``RandomMDP(seed=n)``, rated by ``random_panel(n)`` on ``random_share(n)`` of the
 steps. Scenarios of the study ``panels-development`` may be tuned on (``is_for_development``); those of ``panels``,
@@ -20,6 +20,7 @@ from uard.method.mitigations import Mitigation, named
 from uard.ratings.panels import Panel, random_panel, random_share
 
 OURS, ONE_VETO = "uard", "uard, 1 veto"
+OWN = (OURS, ONE_VETO, "uard-0.1", "uard-paper")  # forms of ours, which are no rivals of it
 ORACLE, FLOOR = "true-reward", "random walk"  # between which regret is measured
 RIVALS = ("raw", *SIMPLE, "witness", "uard-0.1", "uard-paper")
 GRIDS, MDPS = "random grids", "random MDPs"

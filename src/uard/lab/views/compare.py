@@ -97,8 +97,8 @@ class Comparison:
 
     @property
     def identical(self) -> bool:
-        """Whether all seeds that both have are equal bit by bit."""
-        return all(len(c.identical) == len(c.seeds) for c in self.cells)
+        """Whether all seeds that both have are equal bit by bit, and nothing is damaged."""
+        return not self.damaged and all(len(c.identical) == len(c.seeds) for c in self.cells)
 
     @property
     def differs(self) -> bool:
@@ -288,5 +288,6 @@ def lines(comparison: Comparison) -> list[str]:
     if comparison.damaged:
         found.append(f"left out, for they are damaged: {len(comparison.damaged)} results")
     versions = " and ".join("/".join(v) or "none" for v in comparison.versions)
-    verdict = "differ" if comparison.differs else "identical" if comparison.identical else "equal within seed noise"
+    verdict = "differ" if comparison.differs else "identical" if equal == seeds else "equal within seed noise"
+    verdict += " in what can be read" * bool(comparison.damaged)
     return [*found, f"versions: {versions}", f"verdict: {verdict}"]

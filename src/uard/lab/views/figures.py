@@ -116,16 +116,30 @@ class Picture:
     @property
     def csv(self) -> str:
         """Its numbers."""
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(self.columns)
-        writer.writerows([_written(x) for x in row] for row in self.rows)
-        return out.getvalue()
+        return as_csv(self.columns, self.rows)
+
+
+def as_csv(columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
+    """Return numbers and names as CSV; what a table calculator would take for a formula has an apostrophe before it.
+
+    Examples:
+        >>> print(as_csv(("who", "return"), [("raw", -2.5), ("a, b", None), ("=1+1", 3.0)]))
+        who,return
+        raw,-2.5
+        "a, b",
+        '=1+1,3
+        <BLANKLINE>
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([_written(x) for x in row] for row in rows)
+    return out.getvalue()
 
 
 def _written(x: Cell) -> str:
     if isinstance(x, str):
-        return x
+        return f"'{x}" if x.startswith(("=", "+", "-", "@", "\t", "\r")) else x
     return "" if x is None or not np.isfinite(x) else f"{x:.6g}"
 
 

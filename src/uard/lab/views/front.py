@@ -15,8 +15,8 @@ from markupsafe import Markup
 
 from uard.lab import statistics
 from uard.lab.statistics import Summary
-from uard.lab.studies.panels import OURS
-from uard.lab.views import choice, panels
+from uard.lab.studies.panels import OURS, OWN
+from uard.lab.views import choice, figures, panels
 from uard.lab.views.panels import MUCH, Regrets
 from uard.lab.views.sections import Section
 from uard.lab.views.tables import Number, Table
@@ -24,7 +24,6 @@ from uard.lab.views.templates import HERE, render
 
 RAW, PRINTED = "raw", "uard-paper"
 SHADES = (0.05, 0.1, 0.25, 0.5, 1.0)  # regret from which a cell of the heat map is a shade darker
-COMMAND = "uard reproduce panels --seeds 2"
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,7 @@ def answer(found: Sequence[Regrets]) -> str:
 def simplest_equal(found: Sequence[Regrets]) -> str | None:
     """Return a rule that no kind of tasks tells apart from ours, the one with the least regret; None if all are."""
     told = [{r.name: r.corrected < statistics.LEVEL for r in panels.rivals(one)} for one in found]
-    equal = [n for n in found[0].regret if not n.startswith(OURS) and all(n in t and not t[n] for t in told)]
+    equal = [n for n in found[0].regret if n not in OWN and all(n in t and not t[n] for t in told)]
     return min(equal, key=lambda n: float(np.mean([r.regret[n].mean() for r in found]))) if equal else None
 
 
@@ -159,7 +158,7 @@ def three(found: Sequence[Regrets]) -> list[tuple[str, str]]:
 
 def best_rival(found: Sequence[Regrets]) -> str:
     """Return the mitigation with the least mean regret that is not ours."""
-    names = [n for n in found[0].regret if not n.startswith(OURS)]
+    names = [n for n in found[0].regret if n not in OWN]
     return min(names, key=lambda n: float(np.mean([r.regret[n].mean() for r in found])))
 
 
@@ -172,12 +171,13 @@ def _percent(s: Summary, interval: bool) -> str:
     return f"{100 * s.mean:.0f} %{ends}"
 
 
-def section(found: Sequence[Regrets], seeds: int) -> Section:
+def section(found: Sequence[Regrets], seeds: int, command: str) -> Section:
     """Return the first screen.
 
     Args:
         found: Regrets of the study of random panels.
         seeds: Of every mitigation in every scenario.
+        command: What makes it.
     """
     edges = [f"{low:g}–{high:g}" for low, high in pairwise((0, *SHADES))] + [f"{SHADES[-1]:g}+"]
     html = render(
@@ -187,7 +187,7 @@ def section(found: Sequence[Regrets], seeds: int) -> Section:
         map=heat_map(found, seeds),
         edges=edges,
         three=three(found),
-        command=COMMAND,
+        command=command,
         ours=OURS,
     )
     css, js = (Markup((HERE / f"front.{kind}").read_text(encoding="utf-8")) for kind in ("css", "js"))
@@ -227,11 +227,9 @@ def _choices(
 def as_csv(drawn: HeatMap) -> str:
     """Return what the heat map shows, a line for each square."""
     groups = [tasks for tasks, count in drawn.groups for _ in range(count)]
-    lines = ["mitigation,tasks,panel,scenarios,regret,low,high,sd"]
+    rows: list[tuple[figures.Cell, ...]] = []
     for name, squares in drawn.rows:
         for tasks, (kind, count), square in zip(groups, drawn.columns, squares, strict=True):
             s = square.regret
-            numbers = ",".join(f"{x:.6g}" for x in (s.mean, *(s.ci95 or (float("nan"),) * 2), s.sd))
-            quoted = f'"{name}"' if "," in name else name
-            lines.append(f"{quoted},{tasks},{kind},{count},{numbers}")
-    return "\n".join(lines) + "\n"
+            rows.append((name, tasks, kind, float(count), s.mean, *(s.ci95 or (None, None)), s.sd))
+    return figures.as_csv(("mitigation", "tasks", "panel", "scenarios", "regret", "low", "high", "sd"), rows)

@@ -76,12 +76,20 @@ class Loss:
             InvalidValueError: naming the field, the value and what is allowed.
         """
         _checks.choose("kind", self.kind, KINDS)
-        for name in ("study", "what"):
-            if not getattr(self, name).strip():
-                raise _checks.InvalidValueError(name, getattr(self, name), "some words")
-        for name in ("what", "where", "why"):
-            if len(getattr(self, name)) > _LONGEST:
-                raise _checks.InvalidValueError(name, getattr(self, name), f"at most {_LONGEST} characters")
+        for name in ("study", "what", "where", "against", "metric", "note", "why"):
+            text = _checks.instance(name, getattr(self, name), str, "text")
+            if len(text) > _LONGEST:
+                raise _checks.InvalidValueError(name, text, f"at most {_LONGEST} characters")
+            if name in ("study", "what") and not text.strip():
+                raise _checks.InvalidValueError(name, text, "some words")
+        for name in ("ours", "theirs"):
+            s = getattr(self, name)
+            if s is not None:
+                _checks.instance(name, s, Summary, "a uard.lab.statistics.Summary, or None")
+                _checks.finite(name, [s.mean, s.sd, *(s.ci95 or ())])
+        if self.p is not None:
+            _checks.number("p", self.p, low=0, high=1)
+        _checks.whole("of", self.of, low=1)
 
     @property
     def gap(self) -> float | None:

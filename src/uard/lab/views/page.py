@@ -50,6 +50,12 @@ TITLES = {
     "paper.html": "The paper, claim by claim",
     "numbers.html": "Every number",
 }
+_LEADS = {
+    "#choose": "When a simple rule is enough",
+    "#losses": "Where it fails",
+    "paper.html": "The paper's claims",
+    "numbers.html": "Every number",
+}
 _METRICS = f"per episode over the last {WINDOW} training episodes · mean [95 % interval], sd and seeds on hover"
 
 
@@ -82,9 +88,9 @@ def write(
         *grpo.section(grpo.published()),
         _made(store, len(results.seeds)),
     ]
-    theirs, broken = sections.of_packages(results, [*ours, _losses(())])
+    theirs, broken = sections.of_packages(results, ours)
     every = [*ours, *theirs]
-    page = write_pages(folder, [*every, _losses(every)], len(results.seeds), board=True)
+    page = write_pages(folder, every, len(results.seeds), board=True)
     leaderboard.write(folder / sections.BOARD, store, _links(every, board=True))
     return page, broken
 
@@ -94,13 +100,14 @@ def write_pages(folder: Path, every: Sequence[Section], seeds: int, board: bool 
 
     Args:
         folder: Made if it is not there.
-        every: The sections.
+        every: The sections; what they say of losses gets one of its own.
         seeds: Of every cell.
         board: Whether a leaderboard is written beside them.
 
     Raises:
         InvalidValueError: the folder cannot be written.
     """
+    every = [*every, _losses(every)]
     there = {name: [s for s in every if s.page == name] for name in sections.PAGES}
     there = {name: sorted(found, key=lambda s: s.order) for name, found in there.items() if found}
     files.prepare_folder(folder, "report")
@@ -115,6 +122,7 @@ def write_pages(folder: Path, every: Sequence[Section], seeds: int, board: bool 
             meta=_meta(name, seeds),
             version=__version__,
             sections=found,
+            leads=_leads(every) if name == _FIRST else (),
             programs=[f"{{\n{js}\n}}" for js in (_text("tables.js"), *(s.js for s in found)) if js],
             pages=_links(every, board),
         )
@@ -134,6 +142,12 @@ def _links(every: Sequence[Section], board: bool) -> list[tuple[str, str]]:
     used = {s.page for s in every}
     there = [(name, label) for name, label in sections.PAGES.items() if name in used]
     return there + [(sections.BOARD, "Leaderboard")] * board
+
+
+def _leads(every: Sequence[Section]) -> list[tuple[str, str]]:
+    """Return where a reader of the first screen may go on, of what there is."""
+    there = {f"#{s.id}" for s in every if s.page == _FIRST} | {s.page for s in every}
+    return [(target, label) for target, label in _LEADS.items() if target in there]
 
 
 def _text(name: str) -> str:
@@ -183,12 +197,20 @@ def _panels() -> list[Section]:
     (study,) = studies.find(("panels",))
     if not all(map(results.has, study.rows)):
         return []
-    return of_panels(study, panels.regrets(study, results.per_seed), results.seeds(study.name))
+    found, command = panels.regrets(study, results.per_seed), results.command(study.name)
+    return of_panels(study, found, results.seeds(study.name), command)
 
 
-def of_panels(study: Study, found: Sequence[Regrets], seeds: int) -> list[Section]:
-    """Return the first screen, when which rule is enough, and every number of a study of random panels."""
-    return [front.section(found, seeds), front.choose(found), panels.section(study, found, seeds)]
+def of_panels(study: Study, found: Sequence[Regrets], seeds: int, command: str) -> list[Section]:
+    """Return the first screen, when which rule is enough, and every number of a study of random panels.
+
+    Args:
+        study: Of random panels.
+        found: See ``uard.lab.views.panels.regrets``.
+        seeds: Of every row.
+        command: What makes it all.
+    """
+    return [front.section(found, seeds, command), front.choose(found), panels.section(study, found, seeds, command)]
 
 
 def _games() -> Section:

@@ -285,12 +285,12 @@ def task_in_words(environment: TableEnvironment) -> str:
 STRICT = (1.0, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01)  # regret that is still called solved, less and less
 
 
-def picture_of(found: Sequence[Regrets], seeds: int) -> Picture:
+def picture_of(found: Sequence[Regrets], command: str) -> Picture:
     """Draw in what share of scenarios each mitigation has at most so much regret.
 
     Args:
         found: See ``regrets``.
-        seeds: Of every row.
+        command: What makes it.
     """
     titles = [f"{these.tasks}, {len(these.scenarios)} scenarios" for these in found]
     chart = Chart(
@@ -307,9 +307,7 @@ def picture_of(found: Sequence[Regrets], seeds: int) -> Picture:
         "See who stays up as the demand rises from left (no worse than a random walk, 1) to right (as good as learning "
         "from the true reward but for a hundredth). Regret is of means over seeds; a rule is worth its whole line."
     )
-    return chart.picture(
-        "panels", "In how many scenarios a rule is good enough", note, f"uard reproduce panels --seeds {seeds}"
-    )
+    return chart.picture("panels", "In how many scenarios a rule is good enough", note, command)
 
 
 def tables(found: Sequence[Regrets]) -> list[Table]:
@@ -328,19 +326,20 @@ def headline(found: Sequence[Regrets]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def section(study: Study, found: Sequence[Regrets], seeds: int) -> Section:
+def section(study: Study, found: Sequence[Regrets], seeds: int, command: str) -> Section:
     """Return the part of the report: a figure, then tables.
 
     Args:
         study: Of random panels.
         found: See ``regrets``.
         seeds: Of every row.
+        command: What makes it.
     """
     head = (
         f"{study.title}: {seeds} seeds of each mitigation in each scenario. Regret is 0 for an agent that learns from "
         "the true reward, 1 for a random walk."
     )
-    drawn = picture_of(found, seeds)
+    drawn = picture_of(found, command)
     html = f"<p>{escape(head)}</p>{picture(drawn)}{''.join(map(table, tables(found)))}"
     lost = tuple(loss for these in found for loss in losses(these))
     written = figures.files([drawn])

@@ -187,11 +187,14 @@ class Published:
         self.studies = {s.name: s for s in studies}
         self.sources: list[dict[str, Any]] = []
         self._cells: dict[str, Any] = {}
+        self._commands: dict[str, str] = {}
         for f in files:
             _checks.instance("published", f, dict, "what `uard reproduce --extract` wrote")
             if _format_of(f) != FORMAT:
                 raise _checks.InvalidValueError("format", _format_of(f), f"{FORMAT}: {MIGRATE}")
-            self._cells |= cells_of(f)
+            found = cells_of(f)
+            self._cells |= found
+            self._commands |= dict.fromkeys(found, str(f.get("command", "unknown")))
             self.sources.append({k: v for k, v in f.items() if k not in ("cells", "brief")})
 
     @property
@@ -226,6 +229,10 @@ class Published:
     def seeds(self, study: str) -> int:
         """Return the smallest number of seeds of a published row."""
         return min((len(self.seeds_of(r)) for r in self.rows(study)), default=0)
+
+    def command(self, study: str) -> str:
+        """Return what made the published rows of a study."""
+        return next((self._commands[r.cell.key] for r in self.rows(study)), "unknown")
 
     def of(self, row: Row, metric: str) -> Summary:
         """Return a metric's summary."""

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from uard import _checks
+from uard.lab.views import markup
 from uard.lab.views.losses import Loss
 from uard.lab.views.study_results import StudyResults
 from uard.plugins import Plugin, PluginError, brought
@@ -17,6 +18,7 @@ PAGES: Mapping[str, str] = {  # of sections, and what links call them
     "numbers.html": "Every number",
 }
 BOARD = "leaderboard.html"  # is made from a store and has no sections
+_LONGEST = 120  # characters of a heading, and of a file's name
 
 
 @dataclass(frozen=True)
@@ -36,9 +38,9 @@ class Section:
             panels), 60 (every mitigation), 75 (games), 90 (best-of-n).
         html: What it says below its heading; taken as it is, so text in it must be escaped
             (``uard.lab.views.templates``). What would run in it does not: no ``<script>``, no ``onclick``, no
-            ``style`` attributes.
+            ``style`` attributes. What a package brings must end all that it begins, and its ids must be its own.
         label: What the navigation calls it; the title if empty.
-        css: Rules for it.
+        css: Rules for it. They hold on the whole page, so begin each selector with its id.
         js: A program for it, in a scope of its own. Nothing on the page may be loaded from elsewhere.
         losses: Where ``uard`` fails or is beaten: they stand in the table of that name on the first page.
         files: What else is written beside the page: texts by their names.
@@ -62,43 +64,74 @@ class Section:
         Raises:
             InvalidValueError: naming the field, the value and what is allowed.
         """
+        for name in ("id", "title", "html", "label", "css", "js"):
+            _plain(name, getattr(self, name))
+        for name in ("title", "label"):
+            if len(getattr(self, name)) > _LONGEST:
+                raise _checks.InvalidValueError(name, getattr(self, name), f"at most {_LONGEST} characters")
         if not re.fullmatch(r"[a-z][a-z0-9-]*", self.id):
             raise _checks.InvalidValueError("id", self.id, "small letters, digits and hyphens")
         _checks.number("order", self.order)
         _checks.choose("page", self.page, PAGES)
+        if not isinstance(self.losses, tuple):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise _checks.InvalidValueError("losses", self.losses, "a tuple of uard.lab.views.losses.Loss")
         for loss in self.losses:
-            if not isinstance(loss, Loss):  # pyright: ignore[reportUnnecessaryIsInstance]
-                raise _checks.InvalidValueError("losses", loss, "of uard.lab.views.losses.Loss")
-        for name, end in (("css", "</style"), ("js", "</script")):
-            if end in getattr(self, name).lower():
-                raise _checks.InvalidValueError(name, getattr(self, name), f"without {end}>")
-        for name in self.files:
-            if not re.fullmatch(r"\w[\w.-]*", name) or name in (*PAGES, BOARD):
+            _checks.instance("losses", loss, Loss, "of uard.lab.views.losses.Loss")
+        for name, ends in (("css", ("</style",)), ("js", ("</script", "<!--"))):
+            for end in ends:
+                if end in getattr(self, name).lower():
+                    raise _checks.InvalidValueError(name, getattr(self, name), f"without {end}")
+        for name, text in _checks.instance("files", self.files, Mapping, "a mapping of names to texts").items():
+            good = isinstance(name, str) and len(name) <= _LONGEST and re.fullmatch(r"\w[\w.-]*", name)
+            if not good or name.lower() in (*PAGES, BOARD):
                 raise _checks.InvalidValueError("files", name, f"a plain name, none of {', '.join((*PAGES, BOARD))}")
+            _checks.instance(f"files[{name!r}]", text, str, "text")
+
+
+def _plain(name: str, text: object) -> None:
+    """Refuse what a page cannot hold as it is."""
+    if not isinstance(text, str) or re.search("[\0\ud800-\udfff]", text):
+        raise _checks.InvalidValueError(name, text, "text without NUL and without half of a surrogate pair")
 
 
 def of_packages(results: StudyResults, ours: Iterable[Section]) -> tuple[list[Section], list[PluginError]]:
     """Return the sections that packages bring, and what of it is broken.
 
+    Of two that want one name the first has it: ours, then those of uard's own package, then the others by their names.
+
     Args:
         results: What they are made from.
         ours: Whose ids and files nobody else may have.
     """
-    taken = {name for section in ours for name in (section.id, *section.files)}
+    taken = {*RESERVED, *(name for section in ours for name in names(section))}
 
     def read(plugin: Plugin) -> list[Section]:
         made = plugin.call(results)
         if not (isinstance(made, list | tuple) and all(isinstance(s, Section) for s in made)):
             raise PluginError(plugin, f"{_checks.short(made)} is no list of Section")
-        new = [name for section in made for name in (section.id, *section.files)]
-        for name in new:
-            if name in taken or new.count(name) > 1:
-                raise PluginError(plugin, f"the name {name!r} of its section or file is taken")
-        taken.update(new)
         return list(made)
 
     good, bad = brought("report", read)
-    return [section for made in good.values() for section in made], bad
+    kept: list[Section] = []
+    for plugin, section in ((plugin, section) for plugin, made in good.items() for section in made):
+        own = names(section)
+        double = sorted(name for name in set(own) if name in taken or own.count(name) > 1)
+        why = f"the name {double[0]!r} in it is taken" if double else markup.fault(section.html)
+        if why:
+            bad.append(PluginError(plugin, f"its section {section.id!r} is left out, for {why}"))
+        else:
+            taken.update(own)
+            kept.append(section)
+    return kept, bad
+
+
+RESERVED = ("content", "losses", "losses-title", "losses-table")  # ids of every first page
+
+
+def names(section: Section) -> list[str]:
+    """Return what a section calls its own: the ids on its page, and its files as a disk without capitals has them."""
+    heading = [f"{section.id}-title"] if section.title else []
+    return [section.id, *heading, *markup.ids(section.html), *(name.lower() for name in section.files)]
 
 
 def broken() -> list[PluginError]:

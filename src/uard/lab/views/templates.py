@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
@@ -49,9 +50,9 @@ def table(data: Table, id: str = "") -> Markup:
 
     Args:
         data: What it shows.
-        id: Of its figure; made of title and columns if empty.
+        id: Of its figure; made of what it shows if empty.
     """
-    digest = hashlib.sha256("|".join((data.title, *data.columns)).encode()).hexdigest()
+    digest = hashlib.sha256(repr((data.title, data.columns, data.rows)).encode(errors="replace")).hexdigest()
     shown = data.shown()
     details = any(cell.details for row in shown for cell in row)
     name = id or f"table-{digest[:10]}"
@@ -73,7 +74,8 @@ def policy(styles: Iterable[str], programs: Iterable[str]) -> Markup:
     """
 
     def hashes(texts: Iterable[str]) -> str:
-        digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in texts)
+        plain = (re.sub("\r\n?", "\n", text) for text in texts)  # which is what a browser reads
+        digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in plain)
         return " ".join(f"'sha256-{digest}'" for digest in digests) or "'none'"
 
     rules = {
