@@ -307,8 +307,9 @@ def speed() -> str:
         for x in found["lines"]
     ]
     versions = ", ".join(f"{name} {number}" for name, number in found["packages"].items() if number != "not installed")
-    busy = f"load {found['load_at_the_end']:.0f} at its end"
-    made = f"`{found['command']}`: {found['machine']}, {busy} (above the cores: others worked); {versions}."
+    busy = f"load {found['load_at_the_start']:.1f} when it began"
+    took = f"{sum(found['seconds'].values()) / 60:.0f} minutes"
+    made = f"`{found['command']}`: {took}, {found['machine']}, {busy}; {versions}."
     return table(("what", "median [range]", "asked", "met", "roof"), rows, ("what", "met", "roof")) + f"\n\n{made}"
 
 

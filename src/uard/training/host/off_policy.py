@@ -1,4 +1,8 @@
-"""SAC and its family on a simulator: a piece of the run is some steps, and as many updates in one call."""
+"""SAC and its family on a simulator: a piece of the run is some steps, and as many updates in one call.
+
+What the model of ratings predicts of a transition changes when the model is fitted, not when the transition is drawn.
+So a prediction stands in the buffer beside its transition, and is made anew when it is drawn after another fit.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +25,7 @@ from uard.training.host.loop import EpisodeLog, Fixed, Job, Loop, Norm, TrainSta
 
 PIECE = 32  # steps between calls of the compiled update
 FIT_EVERY = 64  # pieces between fits of the model of ratings: 2048 steps
+BLOCK = 256  # transitions that are predicted together
 
 
 class Buffer(NamedTuple):
@@ -33,10 +38,18 @@ class Buffer(NamedTuple):
     terminated: Any
 
 
+class Predicted(NamedTuple):
+    """What is predicted of every transition in the buffer: feedback (M, ...), and after which fit it was, -1 never."""
+
+    feedback: Any
+    fit: Any
+
+
 class Kept(NamedTuple):
-    """What the loop keeps besides: the buffer, and the panel's statistics."""
+    """What the loop keeps besides: the buffer, what is predicted of it, and the panel's statistics."""
 
     buffer: Buffer
+    predicted: Any
     statistics: Any
 
 
@@ -64,7 +77,7 @@ class OffPolicyLoop(Loop):
             norm=Norm.start(environment.features),
             model=model,
             reservoir=reservoir,
-            extra=Kept(buffer, self._panel_statistics(model, reservoir)),
+            extra=Kept(buffer, self._no_predictions(model), self._panel_statistics(model, reservoir)),
             simulator=simulator.save(),
             sums=np.zeros((1, len(LOG))),
             log=np.zeros((0, len(LOG) + 1)),
@@ -77,11 +90,11 @@ class OffPolicyLoop(Loop):
         log = EpisodeLog(state.sums, int(state.steps))
         row, results = self._step(state, simulator, number, log)
         model, statistics = self._collect_ratings(state, row, results, number)
-        learner, buffer = self._update(state, row, model, statistics, number)
+        learner, buffer, predicted = self._update(state, row, model, statistics, number)
         return state._replace(
             agent=learner,
             model=model,
-            extra=Kept(buffer, statistics),
+            extra=Kept(buffer, predicted, statistics),
             simulator=simulator.save(),
             sums=log.sums,
             log=log.all(state.log),
@@ -131,6 +144,15 @@ class OffPolicyLoop(Loop):
             statistics = self._panel_statistics(model, reservoir)
         return model, statistics
 
+    def _no_predictions(self, model: Any) -> Any:
+        """Return room for a prediction of every transition; () for a mitigation that asks nobody."""
+        if not self.job.asks_raters:
+            return ()
+        inputs = jnp.zeros((self._slots, self._width), jnp.float32)
+        read = partial(transitions.read, self.job.rating_model, model, raters=self._fixed.raters)
+        feedback = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(read, inputs))
+        return Predicted(feedback, jnp.full(self._slots, -1, jnp.int32))
+
     def _panel_statistics(self, model: Any, reservoir: Any) -> Any:
         known = (reservoir.inputs, reservoir.seen[0]) if reservoir else self._unknown()
         return _panel_statistics(model, *known, job=self._fixed)
@@ -138,14 +160,18 @@ class OffPolicyLoop(Loop):
     def _unknown(self) -> tuple[np.ndarray, np.int64]:
         return np.zeros((1, self._width), np.float32), np.int64(0)
 
-    def _update(self, state: TrainState, row: Buffer, model: Any, statistics: Any, number: int) -> tuple[Any, Buffer]:
-        """Return the agent after as many updates as there were steps, and the buffer with these steps."""
+    def _update(
+        self, state: TrainState, row: Buffer, model: Any, statistics: Any, number: int
+    ) -> tuple[Any, Buffer, Any]:
+        """Return the agent after as many updates as there were steps, the buffer with these steps, and predictions."""
         done = int(state.steps)
-        learner, buffer, fine = _learn(
+        learner, buffer, predicted, fine = _learn(
             state.agent,
             state.extra.buffer,
+            state.extra.predicted,
             row,
             np.int32(done),
+            np.int32((number + 1) // FIT_EVERY),
             model,
             statistics,
             loop.key_of(self.job.seed, loop.LEARN, number),
@@ -154,7 +180,7 @@ class OffPolicyLoop(Loop):
         )
         if not fine:
             raise FloatingPointError("the agent's parameters or its values left the finite numbers")
-        return learner, buffer
+        return learner, buffer, predicted
 
     def act(self, state: TrainState, observations: np.ndarray) -> np.ndarray:
         """Return the policy's middle actions, (B, actions)."""
@@ -185,44 +211,42 @@ def _panel_statistics(model: Any, sample: Array, seen: Array, *, job: Fixed) -> 
     return transitions.panel_statistics(job.mitigation, job.rating_model, model, sample, seen, job.raters)
 
 
-@partial(jax.jit, static_argnames=("job", "learns"), donate_argnums=(0, 1))
+@partial(jax.jit, static_argnames=("job", "learns"), donate_argnums=(0, 1, 2))
 def _learn(
     state: Any,
     buffer: Buffer,
+    predicted: Any,
     row: Buffer,
     done: Array,
+    fits: Array,
     model: Any,
     statistics: Any,
     key: Array,
     *,
     job: Fixed,
     learns: bool,
-) -> tuple[Any, Buffer, Array]:
+) -> tuple[Any, Buffer, Any, Array]:
     """Put a piece's transitions into the buffer, and take as many updates; also say whether all is finite."""
     agent, mitigation, rating_model, asks_raters, raters, _ = job
     slots = buffer.reward.shape[0]
     count = row.reward.shape[0]
-    buffer = jax.tree.map(lambda kept, new: lax.dynamic_update_slice_in_dim(kept, new, done % slots, 0), buffer, row)
+    place = done % slots
+    buffer = jax.tree.map(lambda kept, new: lax.dynamic_update_slice_in_dim(kept, new, place, 0), buffer, row)
+    if asks_raters:
+        fresh = lax.dynamic_update_slice_in_dim(predicted.fit, jnp.full(count, -1, jnp.int32), place, 0)
+        predicted = predicted._replace(fit=fresh)
     if not learns:
-        return state, buffer, jnp.asarray(True)
+        return state, buffer, predicted, jnp.asarray(True)
     filled = jnp.minimum(done + count, slots)
 
-    def draw(key: Array) -> tuple[Buffer, Array, Array]:
+    def draw(key: Array) -> tuple[Array, Array, Array]:
         draw_key, mask_key, learn_key = jax.random.split(key, 3)
-        places = jax.random.randint(draw_key, (agent.batch,), 0, filled)
-        return jax.tree.map(lambda x: x[places], buffer), mask_key, learn_key
+        return jax.random.randint(draw_key, (agent.batch,), 0, filled), mask_key, learn_key
 
-    def rated(drawn: Buffer) -> Any:
-        """Return the feedback of all batches, which the model predicts at once: large products take half the time."""
-        if not asks_raters:
-            return jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), transitions.nothing(agent.batch))
-        flat: Buffer = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), drawn)
-        inputs = transitions.features(flat.observation, flat.action, flat.next_observation, flat.reward)
-        feedback = transitions.read(rating_model, model, inputs, raters)
-        return feedback.map(lambda x: x.reshape(count, agent.batch, *x.shape[1:]))
-
-    def update(state: Any, given: tuple[Buffer, Any, Array, Array]) -> tuple[Any, Array]:
-        drawn, feedback, mask_key, learn_key = given
+    def update(state: Any, given: tuple[Array, Array, Array]) -> tuple[Any, Array]:
+        places, mask_key, learn_key = given
+        drawn: Buffer = jax.tree.map(lambda x: x[places], buffer)
+        feedback = predicted.feedback.map(lambda x: x[places]) if asks_raters else transitions.nothing(agent.batch)
         expected = transitions.expecting(statistics, feedback)
 
         def reward_fn(sigma_m: Array) -> LearningSignal:
@@ -236,6 +260,26 @@ def _learn(
         state, info = agent.update(state, batch, reward_fn, score_fn, learn_key)
         return state, info.loss
 
-    drawn, mask_keys, learn_keys = jax.vmap(draw)(jax.random.split(key, count))
-    state, losses = lax.scan(update, state, (drawn, rated(drawn), mask_keys, learn_keys))
-    return state, buffer, jnp.isfinite(losses).all()
+    batches = jax.vmap(draw)(jax.random.split(key, count))
+    if asks_raters:
+        read = partial(transitions.read, rating_model, model, raters=raters)
+        predicted = _predicted(read, buffer, predicted, batches[0].reshape(-1), fits)
+    state, losses = lax.scan(update, state, batches)
+    return state, buffer, predicted, jnp.isfinite(losses).all()
+
+
+def _predicted(read: Any, buffer: Buffer, predicted: Predicted, places: Array, fits: Array) -> Predicted:
+    """Return the predictions, anew in those of some places that were made before the latest fit."""
+    stale = predicted.fit[places] != fits
+    (order,) = jnp.nonzero(stale, size=places.size + BLOCK, fill_value=places.size)
+    # Beyond the end, so that nothing is written there.
+    order = jnp.append(places, jnp.full(1, buffer.reward.shape[0]))[order]
+
+    def body(i: Array, predicted: Predicted) -> Predicted:
+        block = lax.dynamic_slice_in_dim(order, i * BLOCK, BLOCK)
+        rows: Buffer = jax.tree.map(lambda x: x[block], buffer)
+        found = read(transitions.features(rows.observation, rows.action, rows.next_observation, rows.reward))
+        new = Predicted(found, jnp.full(BLOCK, fits))
+        return jax.tree.map(lambda x, y: x.at[block].set(y, mode="drop"), predicted, new)
+
+    return lax.fori_loop(0, -(-stale.sum() // BLOCK), body, predicted)
