@@ -313,6 +313,60 @@ def speed() -> str:
     return table(("what", "median [range]", "asked", "met", "roof"), rows, ("what", "met", "roof")) + f"\n\n{made}"
 
 
+def cells_of_ray() -> Mapping[str, Any]:
+    """Return what `benchmarks/many_cells.py` wrote."""
+    return json.loads((ROOT / "benchmarks" / "results" / "many-cells.json").read_text(encoding="utf-8"))
+
+
+def many_cells() -> str:
+    """Return what a study of very many small cells costs on a cluster, and what the loss of its head."""
+    found = cells_of_ray()
+    lost, whole = found["head_lost"], _spaced(found["cells"])
+    again = f"{lost['kept']} kept; the same command did the other {lost['then']}, none twice"
+    rows = [
+        (
+            f"{whole} cells on 8 nodes of 2 workers",
+            f"{found['seconds']:.0f} s, {found['cells_per_second']:.0f} a second",
+        ),
+        ("the driver's own CPU time a cell: handing out, packing, storing", f"{found['driver_ms_per_cell']:.2f} ms"),
+        ("a worker's, the same batches without a cluster", f"{found['worker_ms_per_cell']:.2f} ms"),
+        ("what these two leave of the cores", f"{_left(found):.0f} %: Ray, sixteen starts and compilations"),
+        ("in the store", f"{found['bytes_per_cell']:.0f} bytes a cell"),
+        (f"{_spaced(lost['in_all'])} cells, the head killed at a third of them", again),
+    ]
+    versions = ", ".join(f"{name} {number}" for name, number in found["versions"].items())
+    made = f"`{found['command']}`: {found['cores']} cores for all nodes together; {versions}."
+    return table(("measured", ""), rows, ("measured", "")) + f"\n\n{made}"
+
+
+def _spaced(x: float) -> str:
+    return f"{x:,.0f}".replace(",", " ")
+
+
+def _left(found: Mapping[str, Any]) -> float:
+    busy = 1e-3 * (found["driver_ms_per_cell"] + found["worker_ms_per_cell"]) * found["cells"]
+    return 100 * (1 - busy / (found["cores"] * found["seconds"]))
+
+
+TRAINING = (("a table (0.011 s)", 0.011), ("PPO on the grid (1.9 s)", 1.9), ("DQN on the grid (5.3 s)", 5.3))
+TRAINING += (("the mix of `grid-deep` (7.5 s)", 7.5), ("MuJoCo, PPO, 150 000 steps (100 s)", 100.0))
+"""CPU seconds of a seed, as the table of the guide has them."""
+STORING = 1 / 500
+"""CPU seconds that a result of full size takes to be packed and stored, as the table has it."""
+
+
+def million() -> str:
+    """Return the plan for a million cells of one seed, from what training takes and what the driver takes."""
+    driver = 1e-3 * cells_of_ray()["driver_ms_per_cell"] + STORING
+    rows = []
+    for name, each in TRAINING:
+        hours = [f"{max(1e6 * each / cores, 1e6 * driver) / 3600:.1f} h" for cores in (32, 320, 3200)]
+        rows.append((name, _spaced(1e6 * each / 3600), *hours, _spaced(each / driver)))
+    columns = ("a cell", "core hours", "1 node of 32", "10", "100", "cores that one driver feeds")
+    said = f"The driver's {1e3 * driver:.1f} ms a cell, {1e6 * driver / 3600:.1f} h in all, are the least there is."
+    return table(columns, rows, ("a cell",)) + f"\n\n{said}"
+
+
 def adapters_cost() -> str:
     """Return what the adapters cost, side by side and in their own code."""
     lines = {x["what"].removeprefix("adapter: "): x for x in bench()["lines"] if x["what"].startswith("adapter: ")}
@@ -407,6 +461,8 @@ PUBLISHED: dict[str, Callable[[], str]] = {
     "choose-judges": choose_judges,
     "choose-robots": choose_robots,
     "speed": speed,
+    "many-cells": many_cells,
+    "million": million,
     "adapters-cost": adapters_cost,
     "moved": moved_modules,
     "moved-names": moved_names,

@@ -23,6 +23,7 @@ from uard.training.checkpoint import CheckpointError
 from uard.training.feedback import transition_model as transitions
 from uard.training.feedback.transition_model import TransitionModel
 from uard.training.host import loop as host
+from uard.training.host import off_policy
 from uard.training.host.loop import Job, TrainedRun
 from uard.training.host.loops import loop_of
 
@@ -65,6 +66,30 @@ def test_every_agent_runs_with_every_kind_of_mitigation(agent, mitigation):
     assert np.isfinite(done.log).all()
     assert 0 < done.log[:, 4].sum() <= done.state.steps
     np.testing.assert_allclose(done.ends[-1], done.ends.max())
+
+
+def test_a_prediction_in_the_buffer_is_what_the_model_says_that_made_it(monkeypatch):
+    """The last piece is the one after which the model is fitted for the second time: a part is drawn after that."""
+    spec, drawn = SMALL, []
+    real = off_policy._learn
+    monkeypatch.setattr(off_policy, "_learn", lambda *given, **fixed: drawn.append(given[5]) or real(*given, **fixed))
+    loop = loop_of(job("sac", "uard", 4000))
+    simulator = loop.job.environment.simulator(1, 0)
+    state, models = loop.start(simulator), {}
+    models[0] = state.model
+    for _ in range(2 * off_policy.FIT_EVERY):
+        state = loop.advance(state, simulator)
+        models[int(drawn[-1])] = state.model
+    buffer, predicted, _ = state.extra
+    fits = np.asarray(predicted.fit)
+    assert sorted(models) == [0, 1, 2]
+    assert set(fits.tolist()) >= {1, 2}, "what was not drawn since the fit is as it was"
+    inputs = transitions.features(buffer.observation, buffer.action, buffer.next_observation, buffer.reward)
+    for fit in {1, 2} & set(fits.tolist()):
+        anew = transitions.read(spec, models[fit], inputs, loop.job.fixed.raters)
+        for kept, new in zip(jax.tree.leaves(predicted.feedback), jax.tree.leaves(anew), strict=True):
+            np.testing.assert_allclose(kept[fits == fit], new[fits == fit], rtol=1e-3, atol=1e-3)
+    assert (fits == 2).mean() > 0.6, "1024 draws of 512, 0.86 of which are expected in them"
 
 
 @pytest.mark.parametrize("size", [33, 40])
