@@ -14,15 +14,15 @@ _OURS = frozenset(
     )
 )
 """Elements that act on the whole page, load something, or hide what follows."""
-_ALLOWED = {"script": "application/json"}  # data
-_ID = re.compile(r"""\sid=["']?([^\s"'>]+)""")
+_DATA = "script", "application/json"  # which no browser runs
+_ID = re.compile(r"""<[a-z][^<>]*?\sid\s*=\s*["']?([^\s"'>]+)""", re.IGNORECASE)
 
 
 def ids(html: str) -> list[str]:
     """Return the ids in a text of HTML.
 
     Examples:
-        >>> ids('<p id="one">x</p><svg id=two></svg>')
+        >>> ids('<p id="one">no id=three</p><svg ID = two></svg>')
         ['one', 'two']
     """
     return _ID.findall(html)
@@ -62,8 +62,8 @@ class _Reader(HTMLParser):
         self.open = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        kind = dict(attrs).get("type")
-        if tag in _OURS and not (tag == "title" and self._drawing) and _ALLOWED.get(tag, "") != kind:
+        harmless = (tag, dict(attrs).get("type")) == _DATA or (tag == "title" and self._drawing)
+        if tag in _OURS and not harmless:
             self._found(f"<{tag}> in line {self.getpos()[0]} is not for a part of a page")
         if tag not in _VOID:
             self.open.append((tag, self.getpos()[0]))
