@@ -21,7 +21,7 @@ from uard.adapters.sb3 import (
     ReliabilityRolloutBuffer,
     ReliabilityVecEnv,
 )
-from uard.method.mitigations import RatedReward
+from uard.method.mitigations import RatedReward, named
 from uard.ratings.stream import RewardStream
 
 GRID, HOPPER = "uard/TrapGrid6-v0", "uard/Hopper-Posture-v0"
@@ -160,7 +160,8 @@ def test_critics_are_asked_once_and_training_is_the_same(monkeypatch):
         with monkeypatch.context() as patch:
             if not lend:
                 patch.setattr(CriticDisagreement, "lend", lambda self: None)
-            model = small_sac(replay_buffer_class=ReliabilityReplayBuffer)
+            rule = {"mitigation": named("uard-0.1")}  # in which sigma_m always has a say
+            model = small_sac(replay_buffer_class=ReliabilityReplayBuffer, replay_buffer_kwargs=rule)
             hook = model.critic.q_networks[0].register_forward_hook(lambda *_, n=count: n.__setitem__(0, n[0] + 1))
             model.learn(60, callback=ReliabilityCallback())
             hook.remove()
@@ -169,6 +170,40 @@ def test_critics_are_asked_once_and_training_is_the_same(monkeypatch):
         assert "forward" not in vars(model.critic)
     assert all(torch.equal(weights[0][name], value) for name, value in weights[1].items())
     assert (asked[0], asked[1]) == (2 * 40, 3 * 40)  # with what the actor asks
+
+
+def test_critics_are_asked_only_where_they_have_a_say():
+    """Of steps that somebody has rated `uard` learns the same whatever critics say: those rewards are looked up."""
+
+    def half(observations, actions, following, rewards):
+        said = np.stack([rewards, rewards + 0.5, rewards - 4.0], 1)
+        return np.where((np.abs(1e5 * observations[:, :1]).astype(int) % 2 > 0), said, np.nan)
+
+    model = small_sac(replay_buffer_class=ReliabilityReplayBuffer, replay_buffer_kwargs={"ratings": half})
+    model.learn(120, callback=ReliabilityCallback())
+    buffer, critics = model.replay_buffer, CriticDisagreement(model)
+    buffer.steps.sigma_m = critics
+    rated = ~np.isnan(buffer._ratings[:120, 0]).all(-1)
+    assert 0.2 < rated.mean() < 0.8
+    places = np.arange(120)
+    batch = buffer._get_samples(places)
+    sigma_m = critics.of_batch(batch.observations, batch.actions)
+    anew = buffer._filtered(places, sigma_m)
+    assert np.allclose(batch.rewards.numpy().ravel(), anew.reward, rtol=1e-5, atol=1e-6)
+    assert np.allclose(buffer.latest.sigma_m, sigma_m)
+    assert np.allclose(buffer.latest.reward, anew.reward)
+    asked = []
+    hook = model.critic.q_networks[0].register_forward_hook(lambda *_: asked.append(1))
+    buffer._get_samples(places[rated])
+    assert asked == []
+    buffer._get_samples(places[~rated][:1])
+    hook.remove()
+    assert asked == [1]
+    with torch.no_grad():
+        model.critic.q_networks[0][-1].bias.add_(50.0)  # the critics have learned something else
+    other = buffer._get_samples(places).rewards.numpy().ravel()
+    assert np.array_equal(other[rated], batch.rewards.numpy().ravel()[rated])
+    assert (other[~rated] < batch.rewards.numpy().ravel()[~rated] - 1.0).all()
 
 
 def test_an_answer_is_not_given_to_another_question():

@@ -20,6 +20,7 @@ from uard.method.mitigations import (
 )
 from uard.method.uncertainty import Location
 from uard.method.weights import FORMS
+from uard.ratings.aggregate import aggregate
 
 SIGMA_H = math.sqrt(14 / 9)  # of the ratings {-1, 2, 1}
 WITH_PROXY = math.sqrt(3.25)  # of {-1, 2, 1, 4}
@@ -365,3 +366,21 @@ def test_a_class_says_what_is_wrong_with_it_when_it_is_defined():
 def test_parameters_of_another_kind_are_named(make, message):
     with pytest.raises(InvalidValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("name", sorted(NAMED))
+def test_where_a_mitigation_says_that_it_reads_no_sigma_m_it_reads_none(name):
+    """Raters are quiet, silent, or loud; the loud one is not heard, so that what it rates alone counts as unrated."""
+    rng, chosen = np.random.default_rng(0), named(name)
+    reward = rng.normal(size=60)
+    said = reward[:, None] + rng.normal(size=(60, 4)) * [0.1, 0.1, 0.1, 30.0]
+    said[rng.random((60, 4)) < 0.5] = np.nan
+    known = aggregate(said, reward)
+    statistics = chosen.fit(known, known.count > 0)
+    reads = np.asarray(chosen.reads_sigma_m(known, statistics))
+    assert reads.shape == reward.shape
+    low, high = (np.asarray(chosen.signal(Evidence(reward, np.full(60, x), known), statistics)[0]) for x in (0.0, 3.0))
+    assert np.array_equal(np.broadcast_to(low, 60)[~reads], np.broadcast_to(high, 60)[~reads])
+    if name == "uard":
+        assert 0 < reads.sum() < 60
+        assert (low[reads] > high[reads]).all()

@@ -162,12 +162,18 @@ class _Pairs:
 
 
 class _Singles:
-    """Which steps without keys were judged; their filtered rewards are in the buffer."""
+    """Which steps without keys were judged; their filtered rewards are in the buffer.
+
+    Attributes:
+        open: Whether a step's filtered reward depends on what critics say of it, too.
+        filled: How many steps there are.
+    """
 
     def __init__(self, size: int, filled: int):
         """Start with none judged of ``filled`` steps, in a buffer of ``size``."""
         self._by = np.full(size, -1, np.int64)  # the statistics of the panel by which each was judged
         self._whole, self._new, self.filled = -1, list[int](), filled
+        self.open = np.ones(size, bool)
 
     def put(self, first: int, count: int) -> None:
         """Say that there are new steps in some places, one after the other."""
@@ -282,7 +288,11 @@ class ReliabilityReplayBuffer(ReplayBuffer):
         """The rewards that were sampled last, None before the first."""
         if self._latest is None and self._drawn is not None:
             self._take_in()
-            self._latest = self._filtered(self._drawn, None)
+            critics, asked = self._steps.sigma_m, None
+            if isinstance(critics, CriticDisagreement):
+                drawn = self.observations[self._drawn], self.actions[self._drawn]
+                asked = critics.of_kept(drawn[0].reshape(-1, *self.obs_shape), drawn[1].reshape(-1, self.action_dim))
+            self._latest = self._filtered(self._drawn, asked)
         return self._latest
 
     def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: list[dict[str, Any]]) -> None:
@@ -411,6 +421,8 @@ class ReliabilityReplayBuffer(ReplayBuffer):
         if self._steps.key is not None:
             self._take_in()
         if isinstance(sigma_m, CriticDisagreement) and self.n_envs == 1:
+            if self._singles is not None and _knows_where_it_reads(self._steps.stream.mitigation):
+                return self._looked_up(batch_inds, env, sigma_m, self._singles)
             # The batch that will be learned from, so that its critics need not be asked again.
             batch: Any = super()._get_samples(batch_inds, env)
             self._latest = self._filtered(batch_inds, sigma_m.of_batch(batch.observations, batch.actions))
@@ -425,6 +437,22 @@ class ReliabilityReplayBuffer(ReplayBuffer):
         self._latest = self._filtered(batch_inds, asked)
         self.rewards[batch_inds] = self._fitting(self._latest.reward)
         return super()._get_samples(batch_inds, env)
+
+    def _looked_up(
+        self,
+        places: Integer[np.ndarray, " batch"],
+        env: VecNormalize | None,
+        critics: CriticDisagreement,
+        kept: _Singles,
+    ) -> Any:
+        """Return a batch whose rewards are looked up, but for those that depend on what critics say now."""
+        self._judge_what_is_new(places)
+        batch: Any = super()._get_samples(places, env)
+        if not (asks := kept.open[places]).any():
+            return batch
+        asked = critics.of_batch(batch.observations, batch.actions)
+        self.rewards[places[asks]] = self._fitting(self._filtered(places[asks], asked[asks]).reward)
+        return batch._replace(rewards=self.to_torch(self._normalize_reward(self.rewards[places], env)))
 
     def _judge_what_is_new(self, batch_inds: Integer[np.ndarray, " batch"]) -> None:
         """Filter rewards anew of which something else is known than when they were filtered."""
@@ -447,7 +475,10 @@ class ReliabilityReplayBuffer(ReplayBuffer):
                 if not len(which):
                     return
                 ratings = self._ratings.reshape(-1, self._ratings.shape[2])[which]
-                out = self._filtered_by(self._raw.reshape(-1)[which], ratings)
+                raw = self._raw.reshape(-1)[which]
+                known = aggregate(ratings, raw, ddof=stream.ddof)
+                out = stream.filter(raw, known, keyed=False)
+                singles.open[which] = stream.reads_sigma_m(known, keyed=False)
                 self.rewards.reshape(-1)[which] = _checks.fitting("filtered reward", out.reward, self.rewards.dtype)
 
     def _fitting(self, rewards: Float[np.ndarray, " n"]) -> Float[np.ndarray, "batch E"]:
@@ -469,6 +500,10 @@ class ReliabilityReplayBuffer(ReplayBuffer):
     ) -> Filtered:
         stream = self._steps.stream
         return stream.filter(raw, aggregate(ratings, raw, ddof=stream.ddof), sigma_m, keyed=False)
+
+
+def _knows_where_it_reads(mitigation: Mitigation) -> bool:
+    return type(mitigation).reads_sigma_m is not Mitigation.reads_sigma_m
 
 
 def plain_floats(values: Any, largest: float, missing: bool = False) -> list[float] | None:

@@ -59,6 +59,11 @@ class CriticDisagreement:
         values = once.ask(observations, actions) if isinstance(once, _AskedOnce) else critic(observations, actions)
         return _deviation([value.detach() for value in values])
 
+    def of_kept(self, observations: Any, actions: Any) -> Float[np.ndarray, " B"]:
+        """Return sigma_m of state-actions as a replay buffer has them: states as they are, actions in [-1, 1]."""
+        normalised = self._model.get_vec_normalize_env()
+        return self(observations if normalised is None else normalised.normalize_obs(observations), actions)
+
     def lend(self) -> None:
         """Have the critics remember their last answer, until ``take_back``."""
         from stable_baselines3.common.policies import ContinuousCritic
@@ -75,9 +80,7 @@ class CriticDisagreement:
 
     def outside(self, observations: Any, actions: Any) -> Float[np.ndarray, " B"]:
         """Return sigma_m of state-actions as the environments have them."""
-        normalised = self._model.get_vec_normalize_env()
-        states = observations if normalised is None else normalised.normalize_obs(observations)
-        return self(states, self._model.policy.scale_action(actions))
+        return self.of_kept(observations, self._model.policy.scale_action(actions))
 
 
 def critics_of(model: Any) -> int:

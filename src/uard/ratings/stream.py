@@ -272,6 +272,11 @@ class RewardStream:
         _checks.same_shape("known.count", known.count, "reward", reward)
         return self._filter(reward, known, self._sigma_m(sigma_m, len(reward)), keyed, known.count > 0)
 
+    def reads_sigma_m(self, known: Feedback, *, keyed: bool) -> Bool[np.ndarray, " B"]:
+        """Return of which steps the filtered reward depends on sigma_m; arguments are those of ``filter``."""
+        mitigation = self.mitigation if keyed else self._of_single_visits
+        return mitigation.reads_sigma_m(known, self._measured(keyed))
+
     def _filter(
         self,
         reward: Float[np.ndarray, " B"],

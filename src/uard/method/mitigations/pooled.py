@@ -98,6 +98,12 @@ class PooledDiscounting(Mitigation):
             self._learned(evidence.reward, each_rater(evidence.feedback), evidence.sigma_m, statistics)[0], 1.0
         )
 
+    def reads_sigma_m(self, feedback: Feedback, statistics: Believed) -> Bool[Array, "*batch"]:
+        """Return where nobody is heard: only there does an ensemble's doubt count."""
+        each = each_rater(feedback)
+        raters = rater_statistics.of_raters(statistics.raters, each.count.shape[-1])
+        return ~((each.count > 0) & (raters.heard > 0)).any(-1)
+
     def explain(self, evidence: Evidence, statistics: Believed) -> Explanation:
         """Return what is learned, and why; sigma_h is tau."""
         r = evidence.reward

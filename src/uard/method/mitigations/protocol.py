@@ -184,6 +184,17 @@ class Mitigation(ABC):
         sigma_h = xp.where(feedback.count > 0, feedback.sd, zero)
         return Explanation(signal, sigma_h, zero, zero + 1.0, signal.reward + zero, evidence.sigma_m + sigma_h)
 
+    def reads_sigma_m(self, feedback: Feedback, statistics: Any) -> Bool[Array, "*batch"]:
+        """Return at which steps sigma_m has a say in what is learned: at all, unless a mitigation knows better.
+
+        Who filters often asks for sigma_m there only, and keeps what was learned of the others.
+
+        Args:
+            feedback: What is known of the ratings of these state-actions.
+            statistics: What ``fit`` returned.
+        """
+        return feedback.count == feedback.count
+
     def without_prior(self) -> Mitigation:
         """Return the mitigation for state-actions that never come twice.
 
