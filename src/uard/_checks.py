@@ -210,8 +210,8 @@ def as_numpy(field: str, values: Any) -> np.ndarray:
     Raises:
         InvalidValueError: for all else: text, ``None``, complex numbers, decimals, dictionaries, sets, generators.
     """
-    if type(values) is np.ndarray and values.dtype.char == "d":
-        return values
+    if type(values) is np.ndarray and values.dtype.char in "df":
+        return values if values.dtype.char == "d" else values.astype(np.float64)
     try:
         try:
             return _floats(values)

@@ -70,7 +70,7 @@ __all__ = [
     "critics_of",
 ]
 
-EVERY = 16  # the callback logs one step of so many; of a replay buffer, which must judge a batch for it, a quarter
+EVERY = 16  # the callback logs one step of so many; of a replay buffer, which must judge a batch for it, an eighth
 
 
 class ReliabilityVecEnv(VecEnvWrapper):
@@ -226,9 +226,9 @@ def _refuse_changed(venv: Any) -> None:
 class ReliabilityCallback(BaseCallback):
     """Logs what the filter does under ``uard/``, and lends it the algorithm's critics where it has several.
 
-    Scalars, means of every sixteenth step since the last dump: ``weight``, ``sigma_m``, ``sigma_h``, ``lambda_t``,
-    ``abstained``, ``reward`` and ``raw_reward``; with ``ReliabilityVecEnv`` also ``raw_return`` and
-    ``filtered_return``, of every episode.
+    Scalars, means of every sixteenth step (of a replay buffer every 128th batch) since the last dump: ``weight``,
+    ``sigma_m``, ``sigma_h``, ``lambda_t``, ``abstained``, ``reward`` and ``raw_reward``; with ``ReliabilityVecEnv``
+    also ``raw_return`` and ``filtered_return``, of every episode.
 
     Examples:
         >>> import uard.envs
@@ -271,7 +271,7 @@ class ReliabilityCallback(BaseCallback):
             _refuse_changed(self.training_env)
             self._rollout = source
             return
-        self._source, self._every = source, EVERY if source is env else 4 * EVERY
+        self._source, self._every = source, EVERY if source is env else 8 * EVERY
         if self._critics and source.steps.sigma_m is None and critics_of(self.model) >= 2:
             critics = CriticDisagreement(self.model)
             source.steps.sigma_m = critics if source is replay else critics.outside
