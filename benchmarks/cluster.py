@@ -31,9 +31,9 @@ from uard.training.feedback.rating_model import RatingModel
 def cells():
     deep = {"rating_model": RatingModel()}
     for name, cell, seeds in (
-        ("tabular", Cell(paper_grid(10), named("uard-0.1")), Tabular.at_once),
-        ("dqn", Cell(paper_grid(10), named("uard-0.1"), names.AGENTS["dqn"], **deep), 1),
-        ("ppo", Cell(paper_grid(10), named("uard-0.1"), names.AGENTS["ppo"], **deep), 1),
+        ("tabular", Cell(paper_grid(10), named("uard")), Tabular.at_once),
+        ("dqn", Cell(paper_grid(10), named("uard"), names.AGENTS["dqn"], **deep), 1),
+        ("ppo", Cell(paper_grid(10), named("uard"), names.AGENTS["ppo"], **deep), 1),
     ):
         taken, results = [], []
         for first in (0, seeds):

@@ -195,7 +195,7 @@ def test_standings_by_hand():
         line("raw", 3.0, panel="–", control="legitimate twin", place="twin"),
         line("a", 2.0, control="legitimate twin", place="twin"),
     ]
-    b, a, *rest = standings(these)
+    a, b, *rest = standings(these)  # one of one is unbeaten more surely than one of two
     assert (a.mitigation, a.unbeaten, a.tamer, a.richer, a.poorer) == ("a", (1, 1), (1, 1), (1, 1), (0, 1))
     assert (a.colluding, a.cautious, a.settings) == ((1, 1), (1, 1), 1)
     assert (b.mitigation, b.unbeaten, b.tamer, b.richer, b.poorer) == ("b", (1, 2), (0, 2), (1, 2), (1, 2))
@@ -250,7 +250,7 @@ def test_it_is_readable_without_javascript(opened, board):
     assert not page.locator("#filters").is_visible()
     heads = page.locator("table.lines").first.locator("thead th").all_inner_texts()
     assert [h.replace(" ", "_") for h in heads] == HEADS
-    assert page.locator("button").count() == 0
+    assert page.locator("button:visible").count() == 0
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -150,22 +150,24 @@ def test_every_number_of_the_first_screen_is_a_stored_result(first):
             weights = np.array(counts[i + 1 : i + half])
             assert (groups * weights).sum() / weights.sum() == pytest.approx(here.mean(), abs=0.0051)
             assert weights.sum() == here.size
-    cards = first.locator(".three b").all_inner_texts()
+    cards = [x.replace("\xa0", " ") for x in first.locator(".three b").all_inner_texts()]
 
     def card(name):
         ends = {t: interval(np.array(regrets[name, t])) for t in tasks}
         parts = (
-            f"{100 * np.mean(regrets[name, t]):.0f} % [{100 * ends[t][0]:.0f}, {100 * ends[t][1]:.0f}]" for t in tasks
+            f"{t.removeprefix('random ')} {100 * np.mean(regrets[name, t]):.0f} % "
+            f"[{100 * ends[t][0]:.0f}, {100 * ends[t][1]:.0f}]"
+            for t in tasks
         )
-        return " / ".join(parts)
+        return ", ".join(parts)
 
     assert cards[0] == card("uard")
     rival = re.search(r"lost with ([\w-]+)", first.locator(".three li").nth(1).inner_text())[1]
     assert cards[1] == card(rival)
     lost = np.concatenate([regrets["uard", t] for t in tasks]) > 0.25
     assert cards[2] == f"{lost.sum()} of {lost.size}"
-    raw = " / ".join(f"{100 * np.mean(regrets['raw', t]):.0f} %" for t in tasks)
-    assert f"{raw} with raw" in first.locator(".three li").nth(0).inner_text()
+    raw = ", ".join(f"{t.removeprefix('random ')} {100 * np.mean(regrets['raw', t]):.0f} %" for t in tasks)
+    assert f"with raw {raw}" in first.locator(".three li").nth(0).inner_text().replace("\xa0", " ")
 
 
 def test_the_first_screen_is_a_screen(first):
@@ -396,7 +398,7 @@ def test_the_ledger_can_be_filtered(page, made):
         shown = page.locator("#ledger-table tbody tr:visible td.v").all_inner_texts()
         assert shown == [v for v in verdicts if verdict in ("", v)]
     for verdict in VERDICTS:
-        assert f"{verdicts.count(verdict)} {verdict}" in page.locator("#short").inner_text()
+        assert f"{verdicts.count(verdict)}: {verdict}" in page.locator("#short").inner_text()
 
 
 HOSTILE = """

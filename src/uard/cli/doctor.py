@@ -50,7 +50,7 @@ class Doctor:
     mitigation: str = "uard"
     """The filter that is going to be used."""
     set_mitigation: Pairs = ()
-    """Change a field of it, e.g. kappa=0. Repeatable."""
+    """Change a field of it, e.g. vetoes=1. Repeatable."""
     by: str | None = None
     """A column of the file that divides the rows into parts; agreement is reported within each."""
     set: Pairs = ()

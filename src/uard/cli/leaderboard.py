@@ -72,5 +72,5 @@ def _print(standings: Sequence[Standing], cells: int) -> None:
     terminal.paragraph(
         out,
         "in how many settings, of how many; unbeaten: no other mitigation has a higher true return; hacks less, earns "
-        "more, earns less: than the raw reward, after Holm correction",
+        "more, earns less: than the raw reward, after Holm correction; sorted by what share is surely unbeaten",
     )

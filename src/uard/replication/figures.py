@@ -194,7 +194,7 @@ def noise(results: StudyResults) -> Picture:
     """G11 on the grid: trap visits against rater noise, in both units."""
     units = {"reward units": "a reward unit", "of the trap's reward": "the trap's reward"}
     chart = Chart(
-        ["6x6, main panel"] * 2,
+        [f"6x6, main panel, noise in % of {unit}" for unit in units.values()],
         [f"noise of every rater (sd, % of {unit})" for unit in units.values()],
         "trap visits per episode",
         share=True,

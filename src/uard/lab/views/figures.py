@@ -464,7 +464,7 @@ def competition(results: StudyResults) -> Picture:
         share=True,
     )
     for i, panel in enumerate(panels):
-        for name in ("mean-of-annotations", "worst-of-annotations", "lcb", "uard-consistent", "uard"):
+        for name in ("mean-of-annotations", "worst-of-annotations", "lcb", "excess", "uard"):
             s = [
                 results.get("matrix", "true_return", mitigation=name, size=10, trap=4.0, panel=panel, noise=z)
                 for z in noises
@@ -475,8 +475,8 @@ def competition(results: StudyResults) -> Picture:
     return chart.picture(
         "competition",
         "Against the serious rivals",
-        "See who stays up as raters become noisy: learning from pessimistic ratings is nearly as good without noise, "
-        "and not with it. Points are means over seeds, bands their 95 % intervals.",
+        "See who stays up as raters become noisy, from left to right. Points are means over seeds, bands their 95 % "
+        "intervals.",
         command(results),
     )
 

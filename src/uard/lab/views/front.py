@@ -22,6 +22,7 @@ from uard.lab.views.sections import Section
 from uard.lab.views.tables import Number, Table
 from uard.lab.views.templates import HERE, render
 
+NO_BREAK = "\N{NO-BREAK SPACE}"
 RAW, PRINTED = "raw", "uard-paper"
 SHADES = (0.05, 0.1, 0.25, 0.5, 1.0)  # regret from which a cell of the heat map is a shade darker
 
@@ -133,20 +134,19 @@ def _below(ours: np.ndarray, theirs: np.ndarray) -> bool:
 
 def three(found: Sequence[Regrets]) -> list[tuple[str, str]]:
     """Return the three numbers that a reader should keep, each with what it says."""
-    tasks = " / ".join(r.tasks for r in found)
     ours, raw = _means(found, OURS), _means(found, RAW, interval=False)
     lost = [r.regret[OURS] > MUCH for r in found]
     bad, all_of_them = sum(int(x.sum()) for x in lost), sum(x.size for x in lost)
     equal = simplest_equal(found)
     second = (
-        (_means(found, equal), f"are lost with {equal}, a simpler rule")
+        (_means(found, equal), f"of it is lost with {equal}, a simpler rule")
         if equal
-        else (_means(found, (best := best_rival(found))), f"are lost with {best}, the best of the others")
+        else (_means(found, (best := best_rival(found))), f"of it is lost with {best}, the best of the others")
     )
     return [
         (
             ours,
-            f"of the way from the true reward to a random walk is lost with uard, on {tasks}; {raw} with raw",
+            f"of the way from the true reward to a random walk is lost with uard; with raw {raw}",
         ),
         second,
         (
@@ -163,7 +163,9 @@ def best_rival(found: Sequence[Regrets]) -> str:
 
 
 def _means(found: Sequence[Regrets], name: str, interval: bool = True) -> str:
-    return " / ".join(_percent(statistics.summarise(r.regret[name]), interval) for r in found)
+    means = (_percent(statistics.summarise(r.regret[name]), interval) for r in found)
+    named = (f"{r.tasks.removeprefix('random ')} {mean}" for r, mean in zip(found, means, strict=True))
+    return ", ".join(x.replace(" ", NO_BREAK) for x in named)
 
 
 def _percent(s: Summary, interval: bool) -> str:

@@ -128,7 +128,10 @@ def lines(store: Store) -> list[Line]:
 
 
 def standings(these: Sequence[Line]) -> list[Standing]:
-    """Sum the lines up by mitigation, the one that is unbeaten in most settings first."""
+    """Sum the lines up by mitigation, first the one that is surely unbeaten in the largest share of its settings.
+
+    Sure is the lower end of Wilson's interval: one setting of one proves less than 131 of 131.
+    """
     of: dict[str, list[Line]] = defaultdict(list)
     for x in these:
         of[x.mitigation].append(x)
@@ -162,7 +165,11 @@ def standings(these: Sequence[Line]) -> list[Standing]:
                 sum(x.failed for x in every),
             )
         )
-    return sorted(out, key=lambda s: (-s.unbeaten[0], -s.settings, s.mitigation))
+    return sorted(out, key=lambda s: (-_surely(s.unbeaten), -s.settings, s.mitigation))
+
+
+def _surely(pair: tuple[int, int]) -> float:
+    return statistics.wilson(pair[0] / pair[1], pair[1])[0] if pair[1] else -1.0
 
 
 def caption(these: Sequence[Line]) -> str:

@@ -197,7 +197,7 @@ def _left(p: Published, s: Setting, ours: Row) -> list[Loss]:
         if left.mean > 0.01 * whole.mean and left.mean > least:
             what = f"{100 * left.mean / whole.mean:.0f} % of the raw agent's hacks are left"
             theirs = None if honest is None else p.of(honest, "hacks")
-            out.append(Loss("fails", "robots", what, s.name, "the true reward", left, theirs, "hacks per episode"))
+            out.append(Loss("fails", "robots", what, s.name, "true reward", left, theirs, "hacks per episode"))
     reference = honest if s.region != "none" else s.plain
     if reference is not None:
         own, theirs = p.of(ours, "true_return"), p.of(reference, "true_return")

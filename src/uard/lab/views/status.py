@@ -155,7 +155,7 @@ def lines(runs: Iterable[WorkerRun], now: float | None = None) -> list[str]:
         if run.claimed:
             parts.append(f"{run.claimed} in work" if run.alive else f"{run.claimed} were in work")
         if run.done and stop > run.began:
-            parts.append(f"{60 * run.done / (stop - run.began):.3g} seeds/min")
+            parts.append(f"{60 * run.done / (stop - run.began):,.0f} seeds/min")
         if run.alive and run.remaining is not None:
             parts.append(f"about {duration(max(0.0, run.remaining - max(0.0, now - run.beat)))} left")
         if run.alive and run.beat - now > HEARTBEAT:

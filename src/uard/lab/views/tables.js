@@ -33,12 +33,12 @@ for (const filters of document.querySelectorAll(".filters")) {
     const wanted = [...filters.querySelectorAll("select")].filter(s => s.value);
     const most = all?.getAttribute("aria-pressed") === "true" ? Infinity : first;
     let shown = 0, found = 0, every = 0;
-    for (const body of bodies) for (const row of body.rows) {
+    for (const body of bodies) { let here = 0; for (const row of body.rows) {
       const fits = wanted.every(s => row.dataset[s.dataset.key] === s.value);
-      every += 1; found += fits;
-      row.hidden = !fits || found > most;
+      every += 1; found += fits; here += fits;
+      row.hidden = !fits || here > most;
       shown += !row.hidden;
-    }
+    } }
     count.textContent = `${shown} of ${every} ${noun}` + (shown < found ? `, ${found - shown} more` : "");
   };
   if (all) all.onclick = () => { all.setAttribute("aria-pressed", all.getAttribute("aria-pressed") !== "true"); filter(); };
