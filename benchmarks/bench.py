@@ -101,7 +101,7 @@ def adapters(found: dict[str, Any]) -> Iterator[Line]:
     for row in found["rows"]:
         limit = None if row["limit"] is None else 100 * row["limit"]
         value, low, high = (100 * x for x in (row["cost"], *row["range"]))
-        roof = 100 * row["floor"]
+        roof = max(0.0, 100 * row["floor"])  # less than nothing is noise
         yield Line(f"adapter: {row['name']}", value, low, high, "percent", limit, True, roof, "passes through")
         value, low, high = (100 * x for x in (row["clocked"], *row["clocked_range"]))
         yield Line(f"adapter: {row['name']}, our code", value, low, high, "percent", limit)

@@ -112,7 +112,7 @@ def test_details(capsys):
     assert "rater 2: noise 0.1" in details_of(capsys, "main")
     assert "rater 1: " in details_of(capsys, "random:3")
     scale = details_of(capsys, "scale")
-    assert "36 cells x 10 seeds = 360 runs" in scale
+    assert "30 cells x 10 seeds = 300 runs" in scale, "36 rows, of which some are one cell"
     assert "run it: uard reproduce scale --seeds 10" in scale
     both = details_of(capsys, "panels")
     assert "panels (5)" in both

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from uard.plugins import PluginError
 
 SEEDS = 10  # that `uard reproduce` runs
+FEW = 2  # that are enough where scenarios are the unit of intervals
 _VALUES = 12  # of a label, that are named
 _OPTIONS = {"environment": "--set", "agent": "--set-agent", "mitigation": "--set-mitigation"}
 
@@ -153,21 +154,22 @@ def _of_panel(entry: Entry) -> None:
 def _of_study(study: Study) -> None:
     from uard.cli.catalogue import labels_of, steps_of
 
-    out, steps = terminal.output(), steps_of(study.rows)
-    cells = len(study.rows)
+    every = list({row.cell.key: row for row in study.rows}.values())  # two rows may be one cell: raw asks no panel
+    out, steps, cells = terminal.output(), steps_of(every), len(every)
+    seeds = FEW if study.brief else SEEDS
     terminal.paragraph(out, study.title, "  ")
     if study.answers:
         terminal.paragraph(out, f"answers: {study.answers}", "  ")
-    runs = f"{counted(cells, 'cell')} x {SEEDS} seeds = {cells * SEEDS} runs"
+    runs = f"{counted(cells, 'cell')} x {seeds} seeds = {cells * seeds} runs"
     if steps:
-        runs += f" of {_grouped(steps / cells)} steps at most on average, {_grouped(steps * SEEDS)} steps in all"
+        runs += f" of {_grouped(steps / cells)} steps at most on average, {_grouped(steps * seeds)} steps in all"
     terminal.paragraph(out, runs, "  ")
     if study.development:
         terminal.paragraph(out, "to tune constants on: what is reported comes from other studies", "  ")
     for label, values in labels_of(study):
         more = f" and {len(values) - _VALUES} more" if len(values) > _VALUES else ""
         terminal.paragraph(out, f"{label}: {', '.join(values[:_VALUES])}{more}", "  ", "    ")
-    terminal.paragraph(out, f"run it: uard reproduce {study.name} --seeds {SEEDS}", "  ")
+    terminal.paragraph(out, f"run it: uard reproduce {study.name} --seeds {seeds}", "  ")
     terminal.paragraph(out, f"how far it is: uard status {study.name}", "  ")
 
 
