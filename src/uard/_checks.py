@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar, cast
@@ -42,7 +43,7 @@ def short(value: object) -> str:
     """Return the value as text of at most 200 characters."""
     try:
         text = repr(value)
-    except Exception:  # of somebody else's class; of an int of 5000 digits
+    except (Exception, SystemExit):  # of somebody else's class; of an int of 5000 digits
         text = f"<{type(value).__name__}>"
     return text if len(text) <= 200 else text[:197] + "..."  # a path must be legible
 
@@ -79,6 +80,17 @@ def instance(field: str, value: object, kind: type[T], allowed: str) -> T:
     if not isinstance(value, kind):
         raise InvalidValueError(field, value, allowed)
     return value
+
+
+def text(field: str, value: object) -> str:
+    """Return text as a plain ``str``; refuse what no page and no file can hold.
+
+    Raises:
+        InvalidValueError: it is no text, or has a NUL or half of a surrogate pair in it.
+    """
+    if not isinstance(value, str) or re.search("[\0\ud800-\udfff]", value):
+        raise InvalidValueError(field, value, "text without NUL and without half of a surrogate pair")
+    return str(value)  # of a subclass that calls itself HTML, too
 
 
 def number(

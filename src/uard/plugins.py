@@ -122,7 +122,14 @@ class Plugin:
         except through:
             raise
         except (Exception, SystemExit) as error:  # a package must not end this process either
-            raise PluginError(self, f"{type(error).__name__}: {error}") from error
+            raise PluginError(self, f"{type(error).__name__}: {_said(error)}") from error
+
+
+def _said(error: BaseException) -> str:
+    try:
+        return str(error)
+    except Exception:  # an error of somebody else's class
+        return "which cannot be printed"
 
 
 @cache

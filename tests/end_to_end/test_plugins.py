@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from markupsafe import Markup
 
 from uard import InvalidValueError, plugins
 from uard._checks import UnknownNameError
@@ -111,8 +112,11 @@ def several(results):
     capital = Section("capital", "Capital", 5, "", files={"Shared.json": ""})
     open_ = Section("open", "Open", 6, "<p>x<!-- y")
     away = Section("away", "Away", 7, "<meta http-equiv=refresh content=0>")
-    good = Section("good", "Good", 8, "<p id=good-part>x</p>", files={"shared.json": ""})
-    return [inside, open_, away, good, capital]
+    table = Section("table", "Table", 7.5, "<svg><desc><table/></desc></svg>")
+    store = Section("store", "Store", 7.6, "", files={"kept.sqlite": "gone"})
+    drawing = "<svg><title>t</title><path d='M0'/></svg>"
+    good = Section("good", "Good", 8, f"<p title='a > b' id=good-part>{drawing}</p>", files={"shared.json": ""})
+    return [inside, open_, away, table, store, good, capital]
 """
 OLD = """
 from uard.method.mitigations import Mitigation
@@ -447,7 +451,9 @@ def test_sections_of_packages_join_the_report(broken, tmp_path):
     (control,) = studies.find(("control",))
     runner.run(control.jobs(range(2)), store, workers=1)
     results = StudyResults(store, range(2), studies.grid())
-    good, bad = sections.of_packages(results, [sections.Section("made", "How this was made", 1000, "")])
+    good, bad = sections.of_packages(
+        results, [sections.Section("made", "How this was made", 1000, "")], ["kept.sqlite"]
+    )
     (section,) = (s for s in good if s.id == "example")
     assert "a random walker, 6x6" in section.html
     assert [loss.sentence() for loss in section.losses] == ["bells: nobody has tried uard on bells of 1000."]
@@ -461,6 +467,8 @@ def test_sections_of_packages_join_the_report(broken, tmp_path):
         "'inside' is left out, for the name 'losses-table' in it is taken",
         "'open' is left out, for <!-- begins what no part of a page needs: comments, declarations",
         "'away' is left out, for <meta> in line 1 is not for a part of a page",
+        "'table' is left out, for </desc> in line 1 ends what is not open, or is not the innermost",
+        "'store' is left out, for the name 'kept.sqlite' in it is taken",
         "'capital' is left out, for the name 'shared.json' in it is taken",
     ]
 
@@ -493,6 +501,13 @@ def test_names_are_first_of_all_uards_own(broken):
 def test_silly_sections_are_refused(fields, says):
     with pytest.raises(InvalidValueError, match=re.escape(says)):
         sections.Section(**({"id": "x", "title": "t", "order": 1, "html": ""} | fields))
+
+
+def test_what_was_checked_is_not_changed_afterwards():
+    given = {"a.csv": ""}
+    section = sections.Section("x", Markup("<b>"), 1, "", files=given)
+    given["../up.csv"] = ""
+    assert (dict(section.files), type(section.title)) == ({"a.csv": ""}, str)
 
 
 def test_nothing_is_imported_before_it_is_asked_for(installed):

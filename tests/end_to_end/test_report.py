@@ -426,6 +426,7 @@ def test_what_a_text_brings_onto_the_page_does_not_run_and_our_programs_do(brows
         "meta": "",
         "pages": [],
         "leads": [],
+        "styles": ["", mine.css],
         "programs": programs,
     }
     text = templates.render(templates.HERE, "page.html.j2", sections=[mine, other], **values)

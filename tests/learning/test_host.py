@@ -18,7 +18,7 @@ from uard.agents.policy import CPO, PPO, TRPO
 from uard.envs.locomotion.locomotion import Kick, Locomotion
 from uard.envs.locomotion.regions import Vibration
 from uard.lab.registry import continuous_agents
-from uard.method.mitigations import Feedback, named
+from uard.method.mitigations import Evidence, Feedback, named
 from uard.training.checkpoint import CheckpointError
 from uard.training.feedback import transition_model as transitions
 from uard.training.feedback.transition_model import TransitionModel
@@ -58,7 +58,13 @@ def same(a, b):
 
 @pytest.mark.parametrize(
     ("agent", "mitigation"),
-    [*((agent, "uard-0.1") for agent in AGENTS), ("ppo", "raw"), ("ppo", "uard-paper"), ("sac", "screening")],
+    [
+        *((agent, "uard-0.1") for agent in AGENTS),
+        ("ppo", "raw"),
+        ("ppo", "uard-paper"),
+        ("sac", "screening"),
+        ("sac", "log-mean-exp"),
+    ],
 )
 def test_every_agent_runs_with_every_kind_of_mitigation(agent, mitigation):
     done = run(job(agent, mitigation, 256))
@@ -314,6 +320,20 @@ def test_the_anchor_of_a_predicted_step_is_the_prediction_however_little_it_is_w
     anchor = uard.reward_anchor(f.proxy, f, transitions.expecting(uard.fit(f, f.count > 0), f))
     np.testing.assert_allclose(anchor, [-2.0, 3.0], rtol=1e-6)
     assert transitions.expecting((), f) == ()
+
+
+@pytest.mark.parametrize("name", ["median", "min-proxy-mean", "min-proxy-median", "uwo", "log-mean-exp", "excess"])
+def test_before_the_first_fit_nothing_is_known_and_the_reward_is_believed(name):
+    model = transitions.init(SMALL, jax.random.key(0), 4, 3)
+    inputs = 5.0 * jax.random.normal(jax.random.key(1), (50, 4))
+    feedback = transitions.read(SMALL, model, inputs, 3)
+    assert (feedback.count == 0).all()
+    mitigation = named(name)
+    statistics = mitigation.fit(feedback, feedback.count > 0)
+    learned = mitigation.signal(Evidence(inputs[:, -1], np.zeros(50, np.float32), feedback), statistics).reward
+    assert np.isfinite(learned).all()
+    if name not in ("excess",):  # which believes what nobody has rated in part
+        np.testing.assert_array_equal(learned, inputs[:, -1])
 
 
 def test_without_ratings_the_model_stays_as_it_was():

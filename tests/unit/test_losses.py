@@ -50,6 +50,8 @@ def test_how_sure(fields, says):
         ({"where": None}, "where = None: must be text"),
         ({"ours": 1.0}, "ours = 1.0: must be a uard.lab.statistics.Summary, or None"),
         ({"theirs": THEIRS._replace(mean=float("nan"))}, "theirs[0] = nan: must be finite"),
+        ({"study": "g\ud800"}, "must be text without NUL"),
+        ({"ours": OURS._replace(ci95=(1.0,))}, "must be what uard.lab.statistics.summarise gives"),
         ({"p": "small"}, "p = 'small': must be a finite number in [0, 1]"),
         ({"p": float("nan")}, "p = nan: must be"),
         ({"of": 0}, "of = 0: must be a whole number >= 1"),

@@ -182,6 +182,8 @@ class Reproduce:
             raise InvalidValueError("report", self.report, "left out unless all grid studies are run, or panels alone")
         if self.published is not None and not alone:
             raise InvalidValueError("published", self.published, "left out unless panels alone are shown")
+        if self.published is not None and self.mitigation:
+            raise InvalidValueError("mitigation", self.mitigation, "left out with --published, which trains nothing")
         if self.published is not None and self.extract is not None:
             raise InvalidValueError("extract", self.extract, "left out with --published, which trains nothing")
         if self.report is not None:

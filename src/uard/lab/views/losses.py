@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 from markupsafe import Markup, escape
 
 from uard import _checks
@@ -77,7 +78,8 @@ class Loss:
         """
         _checks.choose("kind", self.kind, KINDS)
         for name in ("study", "what", "where", "against", "metric", "note", "why"):
-            text = _checks.instance(name, getattr(self, name), str, "text")
+            text = _checks.text(name, getattr(self, name))
+            object.__setattr__(self, name, text)
             if len(text) > _LONGEST:
                 raise _checks.InvalidValueError(name, text, f"at most {_LONGEST} characters")
             if name in ("study", "what") and not text.strip():
@@ -86,6 +88,8 @@ class Loss:
             s = getattr(self, name)
             if s is not None:
                 _checks.instance(name, s, Summary, "a uard.lab.statistics.Summary, or None")
+                if np.ndim(s.per_seed) != 1 or (s.ci95 is not None and np.shape(s.ci95) != (2,)):
+                    raise _checks.InvalidValueError(name, s, "what uard.lab.statistics.summarise gives")
                 _checks.finite(name, [s.mean, s.sd, *(s.ci95 or ())])
         if self.p is not None:
             _checks.number("p", self.p, low=0, high=1)

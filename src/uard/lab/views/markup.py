@@ -15,17 +15,24 @@ _OURS = frozenset(
 )
 """Elements that act on the whole page, load something, or hide what follows."""
 _DATA = "script", "application/json"  # which no browser runs
-_ID = re.compile(r"""<[a-z][^<>]*?\sid\s*=\s*["']?([^\s"'>]+)""", re.IGNORECASE)
+_ENDED = frozenset(
+    re.findall(
+        r"\w+",
+        "path circle ellipse line polygon polyline rect g use image text tspan stop defs marker mask pattern symbol "
+        "lineargradient radialgradient clippath animate set",
+    )
+)
+"""Elements of drawings that a slash ends; of HTML it ends nothing."""
 
 
 def ids(html: str) -> list[str]:
     """Return the ids in a text of HTML.
 
     Examples:
-        >>> ids('<p id="one">no id=three</p><svg ID = two></svg>')
+        >>> ids('<p title="a > b, id=no" id="one">no id=three</p><svg ID = two></svg>')
         ['one', 'two']
     """
-    return _ID.findall(html)
+    return _read(html).ids
 
 
 def fault(html: str) -> str | None:
@@ -41,8 +48,7 @@ def fault(html: str) -> str | None:
     """
     if (at := re.search("<[!?]", html)) is not None:
         return f"{html[at.start() : at.start() + 4]} begins what no part of a page needs: comments, declarations"
-    reader = _Reader(convert_charrefs=False)
-    reader.feed(html)
+    reader = _read(html)
     if reader.fault is None and "<" in reader.rawdata:
         return f"a tag is not ended in line {reader.getpos()[0]}"
     if reader.fault is None and reader.open:
@@ -51,17 +57,25 @@ def fault(html: str) -> str | None:
     return reader.fault
 
 
+def _read(html: str) -> _Reader:
+    reader = _Reader(convert_charrefs=False)
+    reader.feed(html)
+    return reader
+
+
 class _Reader(HTMLParser):
-    """Follows what is open; remembers the first fault."""
+    """Follows what is open; remembers ids, and the first fault."""
 
     open: list[tuple[str, int]]
+    ids: list[str]
     fault: str | None = None
 
     def __init__(self, **options: bool):
         super().__init__(**options)
-        self.open = []
+        self.open, self.ids = [], []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.ids += [value for name, value in attrs if name == "id" and value]
         harmless = (tag, dict(attrs).get("type")) == _DATA or (tag == "title" and self._drawing)
         if tag in _OURS and not harmless:
             self._found(f"<{tag}> in line {self.getpos()[0]} is not for a part of a page")
@@ -70,7 +84,7 @@ class _Reader(HTMLParser):
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.handle_starttag(tag, attrs)
-        if tag not in _VOID and self._drawing:  # elsewhere the slash ends nothing
+        if tag in _ENDED and self._drawing:
             self.open.pop()
 
     def handle_endtag(self, tag: str) -> None:
@@ -81,7 +95,9 @@ class _Reader(HTMLParser):
 
     @property
     def _drawing(self) -> bool:
-        return any(name == "svg" for name, _ in self.open)
+        """Whether what is read now is part of a drawing, not of HTML inside one."""
+        inside = [name for name, _ in self.open if name in ("svg", "desc", "title", "foreignobject")]
+        return bool(inside) and inside[-1] == "svg"
 
     def _found(self, fault: str) -> None:
         self.fault = self.fault or fault

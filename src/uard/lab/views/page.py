@@ -88,7 +88,8 @@ def write(
         *grpo.section(grpo.published()),
         _made(store, len(results.seeds)),
     ]
-    theirs, broken = sections.of_packages(results, ours)
+    own = [f"{Path(store.path).name}{end}" for end in ("", "-wal", "-shm")]  # the store may lie in this folder
+    theirs, broken = sections.of_packages(results, ours, own)
     every = [*ours, *theirs]
     page = write_pages(folder, every, len(results.seeds), board=True)
     leaderboard.write(folder / sections.BOARD, store, _links(every, board=True))
@@ -123,7 +124,8 @@ def write_pages(folder: Path, every: Sequence[Section], seeds: int, board: bool 
             version=__version__,
             sections=found,
             leads=_leads(every) if name == _FIRST else (),
-            programs=[f"{{\n{js}\n}}" for js in (_text("tables.js"), *(s.js for s in found)) if js],
+            styles=[_text("style.css") + _text("data.css"), *(s.css for s in found if s.css)],
+            programs=[f"(() => {{\n{js}\n}})();" for js in (_text("tables.js"), *(s.js for s in found)) if js],
             pages=_links(every, board),
         )
         files.write(folder / name, page, "report")

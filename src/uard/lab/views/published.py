@@ -289,7 +289,7 @@ def read_file(path: str) -> Any:
     """
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         allowed = f"a file that `uard reproduce --extract` wrote ({error})"
         raise _checks.InvalidValueError("published", path, allowed) from None
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 from uard import _checks
 from uard.lab.views import markup
@@ -64,8 +65,9 @@ class Section:
         Raises:
             InvalidValueError: naming the field, the value and what is allowed.
         """
-        for name in ("id", "title", "html", "label", "css", "js"):
-            _plain(name, getattr(self, name))
+        for name in ("id", "title", "label", "css", "js"):
+            object.__setattr__(self, name, _checks.text(name, getattr(self, name)))
+        _checks.text("html", self.html)
         for name in ("title", "label"):
             if len(getattr(self, name)) > _LONGEST:
                 raise _checks.InvalidValueError(name, getattr(self, name), f"at most {_LONGEST} characters")
@@ -81,20 +83,18 @@ class Section:
             for end in ends:
                 if end in getattr(self, name).lower():
                     raise _checks.InvalidValueError(name, getattr(self, name), f"without {end}")
-        for name, text in _checks.instance("files", self.files, Mapping, "a mapping of names to texts").items():
+        given = dict(_checks.instance("files", self.files, Mapping, "a mapping of names to texts"))
+        object.__setattr__(self, "files", MappingProxyType(given))  # nobody changes it after this
+        for name, text in given.items():
             good = isinstance(name, str) and len(name) <= _LONGEST and re.fullmatch(r"\w[\w.-]*", name)
             if not good or name.lower() in (*PAGES, BOARD):
                 raise _checks.InvalidValueError("files", name, f"a plain name, none of {', '.join((*PAGES, BOARD))}")
             _checks.instance(f"files[{name!r}]", text, str, "text")
 
 
-def _plain(name: str, text: object) -> None:
-    """Refuse what a page cannot hold as it is."""
-    if not isinstance(text, str) or re.search("[\0\ud800-\udfff]", text):
-        raise _checks.InvalidValueError(name, text, "text without NUL and without half of a surrogate pair")
-
-
-def of_packages(results: StudyResults, ours: Iterable[Section]) -> tuple[list[Section], list[PluginError]]:
+def of_packages(
+    results: StudyResults, ours: Iterable[Section], kept_files: Collection[str] = ()
+) -> tuple[list[Section], list[PluginError]]:
     """Return the sections that packages bring, and what of it is broken.
 
     Of two that want one name the first has it: ours, then those of uard's own package, then the others by their names.
@@ -102,12 +102,13 @@ def of_packages(results: StudyResults, ours: Iterable[Section]) -> tuple[list[Se
     Args:
         results: What they are made from.
         ours: Whose ids and files nobody else may have.
+        kept_files: Names of other files in the report's folder that no section may write.
     """
-    taken = {*RESERVED, *(name for section in ours for name in names(section))}
+    taken = {*RESERVED, *(name.lower() for name in kept_files), *(name for section in ours for name in names(section))}
 
     def read(plugin: Plugin) -> list[Section]:
         made = plugin.call(results)
-        if not (isinstance(made, list | tuple) and all(isinstance(s, Section) for s in made)):
+        if not (type(made) in (list, tuple) and all(isinstance(s, Section) for s in made)):
             raise PluginError(plugin, f"{_checks.short(made)} is no list of Section")
         return list(made)
 

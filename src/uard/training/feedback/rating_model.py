@@ -205,6 +205,7 @@ def read(spec: RatingModel, model: Model, observations: Array, actions: int, rat
     if spec.predicts == "ratings":
         return Feedback(count, predicted[..., 0], lowest, jnp.maximum(sd, 0.0), proxy, everybody)
     heard = model.noise >= 0
+    count = jnp.where(heard.any(), count, 0.0)  # before the first fit nothing is known, whatever the members say
     noise = jnp.where(heard, model.noise, 0.0)
     variance = (model.scale * out)[..., :raters].var(0, ddof=1)
     answers = jnp.where(heard, noise / jnp.maximum(variance, 1e-6 * model.scale[0] ** 2), 0.0)

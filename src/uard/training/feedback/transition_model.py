@@ -230,6 +230,7 @@ def read(spec: TransitionModel, model: Model, inputs: Array, raters: int) -> Fee
     typical = model.location[-1]
     sd = jnp.maximum(typical + soft_threshold(predicted[..., -1] - typical, spec.deviations), 0.0)
     heard = model.noise >= 0
+    count = jnp.where(heard.any(), count, 0.0)  # before the first fit nothing is known, whatever the members say
     noise = jnp.where(heard, model.noise, 0.0)
     answers = jnp.where(heard, noise / jnp.maximum(ratings.var(0, ddof=1), 1e-6 * model.scale**2), 0.0)
     by_rater = ByRater(answers, ratings.mean(0), noise * jnp.maximum(answers - 1.0, 0.0))
