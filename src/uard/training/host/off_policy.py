@@ -148,7 +148,7 @@ class OffPolicyLoop(Loop):
         """Return room for a prediction of every transition; () for a mitigation that asks nobody."""
         if not self.job.asks_raters:
             return ()
-        inputs = jnp.zeros((self._slots, self._width), jnp.float32)
+        inputs = jax.ShapeDtypeStruct((self._slots, self._width), jnp.float32)
         read = partial(transitions.read, self.job.rating_model, model, raters=self._fixed.raters)
         feedback = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(read, inputs))
         return Predicted(feedback, jnp.full(self._slots, -1, jnp.int32))
